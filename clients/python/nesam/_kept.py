@@ -128,12 +128,11 @@ class Kept:
                 answer = replace(one.answer, place=answer.place, durable_place=answer.durable_place)
             self._run, self._place, one.answer = answer.run, answer.place, answer
             self._answered.append(one)
+            self._durable(answer.durable_place)
         else:
-            # It is not kept.
+            # It is not kept. What is durable is that of a session with places: this one may have begun anew.
             self._refused.append((one, answer))
         self._waiting.popleft()
-        if answer.run == self._run:
-            self._durable(answer.durable_place)
         return None if self._waiting else answer
 
     def told(self, session: t.Session) -> bool:
@@ -147,9 +146,7 @@ class Kept:
 
     def tell_refused(self, told: Optional[t.Answer] = None) -> None:
         """Raises Refused for what was refused since it was raised last, but for the one with the answer `told`."""
-        # What the same session took before is in it, though it may be too old to come again.
-        missing = [pair for pair in self._refused if pair[0].answer is None or pair[0].answer.run != pair[1].run]
-        refused = [(one.measurement, answer) for one, answer in missing if answer is not told]
+        refused = [(one.measurement, answer) for one, answer in self._refused if answer is not told]
         self._refused.clear()
         if refused:
             raise Refused(refused, told)
@@ -176,7 +173,7 @@ class Kept:
         """The session was closed, or began anew: what it had is gone with it, and all is sent again, from the oldest on."""
         self.forget_places()
         self._place = 0
-        for one in (*self._waiting, *(refused for refused, _ in self._refused)):
+        for one in self._waiting:
             one.answer = None
 
     def _agrees(self, measurement: t.Measurement) -> bool:

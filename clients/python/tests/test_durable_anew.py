@@ -216,6 +216,12 @@ def test_regress_what_the_session_does_not_know_again_keeps_its_place():
     assert len(kept) == 3, "an answer without a place does not say that the session is the same"
     kept.answered(answer("DUPLICATE", 3, durable_place=1))
     assert [measurement.sequence for measurement in kept.pending] == [2, 3] and refused(kept) == []
+    # Another client opened the session anew: what is durable there is not what this one has sent.
+    kept = kept_of(1)
+    kept.answered(answer("DUPLICATE", 1))
+    kept.put(DRIVE[3])
+    kept.answered(answer("TOO_OLD", durable_place=9))
+    assert [measurement.sequence for measurement in kept.pending] == [1] and refused(kept) == [4]
     # One that never had a place: nobody was told of it, as its connection broke.
     kept = kept_of(1)
     kept.put(DRIVE[1])

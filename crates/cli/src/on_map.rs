@@ -1,6 +1,5 @@
 //! Whether drives are where their maps are.
 
-use nesam_import::standing_height_m;
 use nesam_physics::Vehicle;
 use nesam_terrain::WorldMap;
 use nesam_trajectories::Trajectory;
@@ -23,7 +22,7 @@ pub fn doubts(drives: &[Trajectory], world: &str, map: &WorldMap, vehicle: &Vehi
     let count = above.len().max(1) as f64;
     let mean = above.iter().sum::<f64>() / count;
     let spread = (above.iter().map(|h| (h - mean).powi(2)).sum::<f64>() / count).sqrt();
-    let stands = standing_height_m(vehicle);
+    let stands = vehicle.standing_height_m();
     let mut found = Vec::new();
     if outside * 10 > above.len() {
         let all = outside + above.len();

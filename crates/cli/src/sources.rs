@@ -95,6 +95,11 @@ pub fn beyond_range_note(beyond: &BeyondRange) -> String {
 
 /// The drives that training left for validation, for `option`, which does `what` with them; only the train split has any.
 pub fn validation_drives(args: &DataArgs, option: &str, what: &str) -> Result<Drives, Failure> {
+    parted_drives(args, option, what).map(|(validating, _)| validating)
+}
+
+/// The same and the drives that train.
+pub fn parted_drives(args: &DataArgs, option: &str, what: &str) -> Result<(Drives, Vec<Trajectory>), Failure> {
     if args.split != SplitArg::Train {
         return Err(Failure::input(format!("{option} needs --split train: {what} on validation drives of the train split")));
     }
@@ -102,7 +107,8 @@ pub fn validation_drives(args: &DataArgs, option: &str, what: &str) -> Result<Dr
     let mut sorted: Vec<(Trajectory, Option<Arc<WorldMap>>)> = all.drives.into_iter().zip(all.maps).collect();
     sorted.sort_by(|(a, _), (b, _)| a.id.cmp(&b.id));
     let count = sorted.len();
-    (all.drives, all.maps) = sorted.into_iter().enumerate().filter(|(i, _)| is_validation(*i, count)).map(|(_, drive)| drive).unzip();
+    let (validating, training): (Vec<_>, Vec<_>) = sorted.into_iter().enumerate().partition(|(i, _)| is_validation(*i, count));
+    (all.drives, all.maps) = validating.into_iter().map(|(_, drive)| drive).unzip();
     if all.drives.is_empty() {
         return Err(Failure::input(format!(
             "{option}: training leaves every tenth drive for validation where there are {VALIDATED_FROM} or more; with the {count} of set `{}` all train, and \
@@ -110,7 +116,7 @@ pub fn validation_drives(args: &DataArgs, option: &str, what: &str) -> Result<Dr
             all.set
         )));
     }
-    Ok(all)
+    Ok((all, training.into_iter().map(|(_, (drive, _))| drive).collect()))
 }
 
 /// Training drives to fit baselines on: of the same set, else of the first set of the root that has a train split; `None` when none has.

@@ -236,7 +236,7 @@ impl Asked<'_> {
         let Proven { mut judgement, learned, taught, mut scores, verdict, mut reason } =
             self.proven(&mut case, judge_by, &yardstick, judgement, &held_drives)?;
         let claims = verdict.claims();
-        let assumed = predictor.bundle().normalization.default_soil();
+        let assumed = predictor.bundle().default_soil();
         let soils = soils(&case, assumed, if claims { taught.beside } else { case.bench.ground });
         // Where the map is wrong another soil imitates it.
         let of_map = claims && judgement.claimed().into_iter().any(|i| judgement.findings[i].candidate.layer() == Layer::Map);
@@ -404,7 +404,7 @@ fn held_against<'a>(
                 work: &work,
             };
             let better = trial.ground_is_better((&[], &SoilCorrection::NONE), (&[], &ground.correction()))?;
-            ground_alone = Some(if better { ground } else { ground.declined() });
+            ground_alone = Some(if better { ground } else { Ground::assumed() });
         }
         let mut case = case_of(own_reference::metric(&bench, &observed)?, bench, observed, progress);
         case.ground_alone = ground_alone;

@@ -29,7 +29,7 @@ const STEP: f64 = 0.25;
 pub struct Soils {
     /// What the model assumed.
     pub assumed: [f64; SOIL_DIM],
-    /// What explains the drives best without an effect, whether predictions are better on it or not.
+    /// What explains the drives best without an effect where predictions are better on it, else what was assumed.
     pub alone: [f64; SOIL_DIM],
     /// What is taken beside the claimed effects.
     pub beside: [f64; SOIL_DIM],
@@ -44,8 +44,6 @@ pub(crate) struct Ground {
     shares: DVector<f64>,
     /// What each drive says of the shares there.
     drives: Vec<Condensed>,
-    /// Whether predictions are no better on it, so that the assumed one stays.
-    declined: bool,
 }
 
 impl Ground {
@@ -67,7 +65,7 @@ impl Ground {
         let shares = DVector::zeros(SOIL_DIM);
         let rows = rows_at(&shares);
         let mut least = distance(&shares, &rows);
-        let mut best = Self { from: bench.ground, drives: said_at(&shares, &rows), shares, declined: false };
+        let mut best = Self { from: bench.ground, drives: said_at(&shares, &rows), shares };
         for _ in 0..ITERATIONS {
             let mut to = best.without(None);
             let next = (0..=HALVINGS).find_map(|_| {
@@ -95,12 +93,12 @@ impl Ground {
 
     /// The soil as a correction of the assumed one.
     pub fn correction(&self) -> SoilCorrection {
-        if self.declined { SoilCorrection::NONE } else { self.moved(&self.shares) }
+        self.moved(&self.shares)
     }
 
-    /// The assumed soil in its place.
-    pub fn declined(self) -> Self {
-        Self { declined: true, ..self }
+    /// The assumed soil, where predictions are no better on a fitted one.
+    pub fn assumed() -> Self {
+        Self { from: SoilCorrection::NONE, shares: DVector::zeros(SOIL_DIM), drives: Vec::new() }
     }
 
     fn moved(&self, shares: &DVector<f64>) -> SoilCorrection {
@@ -110,7 +108,7 @@ impl Ground {
 
     /// The same by one step without a drive.
     pub fn correction_without(&self, drive: usize) -> SoilCorrection {
-        if self.declined { SoilCorrection::NONE } else { self.moved(&self.without(Some(drive))) }
+        self.moved(&self.without(Some(drive)))
     }
 
     /// Where one step leads from here, a drive left out.

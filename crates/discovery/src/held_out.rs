@@ -17,7 +17,7 @@ use crate::work::Work;
 /// What was learned without a drive, for that drive.
 #[derive(Clone, Debug)]
 pub struct Learned {
-    /// Best soil correction without an effect.
+    /// Best soil correction without an effect; of a model on trial without a map none where predictions are no better on it.
     pub soil: SoilCorrection,
     /// Soil correction beside the effects; none where the ground is neither on trial nor another than the map shows.
     pub beside: SoilCorrection,
@@ -91,6 +91,11 @@ impl Scoring {
     pub fn windows<'a>(&self, drives: &'a [Trajectory]) -> Result<Vec<Window<'a>>, EvaluationError> {
         all_windows(drives, self.horizon, self.history, Truth::Measured)
     }
+
+    /// Draws of the bootstrap over so many drives.
+    pub(crate) fn resamples_of(&self, drives: usize) -> Resamples {
+        Resamples::draw(drives, self.resamples, self.seed)
+    }
 }
 
 /// Rolls every window of the held-out drives out before, with the best soil, and after. `learned[i]` belongs to `drives[i]`.
@@ -122,7 +127,7 @@ pub fn score_held_out(
             Ok([before, soil, after])
         })
         .collect::<Result<_, EvaluationError>>()?;
-    let resamples = Resamples::draw(drives.len(), scoring.resamples, scoring.seed);
+    let resamples = scoring.resamples_of(drives.len());
     let of = |m: usize, chosen: &[usize]| {
         let windows: Vec<Window<'_>> = chosen.iter().map(|w| windows[*w]).collect();
         let paths = chosen.iter().map(|w| paths[*w][m].clone()).collect();

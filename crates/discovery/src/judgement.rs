@@ -77,22 +77,18 @@ impl Judgement {
 
     /// The same with what earlier looks refused, which is named where nothing else stands out.
     pub(crate) fn with_refused(mut self, refused: Vec<Finding>) -> Self {
+        self.reason = self.naming(&refused).unwrap_or(self.reason);
+        self.findings.extend(refused);
+        self
+    }
+
+    /// The reason where nothing is chosen and one of these findings stands out but was refused.
+    fn naming(&self, refused: &[Finding]) -> Option<String> {
         let nothing_else = self.verdict == Verdict::Unexplained && self.selection.chosen.is_empty();
         let standing_out = refused.iter().filter(|f| nothing_else && f.z >= self.selection.threshold);
-        if let Some(Finding { candidate, z, refused: Some(why), .. }) = standing_out.max_by(|a, b| a.z.total_cmp(&b.z)) {
-            let ((most, what), label) = (&self.selection.remaining, candidate.label());
-            self.reason =
-                format!("{DIFFER_FROM_MODEL}, most in {what} (z = {most:.1}); {label} stands out (z = {z:.1}) but was refused: {why}");
-        }
-        // A look after the ground was taken to be another may refuse the same again.
-        let mut said: Vec<usize> = Vec::new();
-        self.findings.extend(refused.into_iter().rev().filter(|f| {
-            !said.contains(&f.hypothesis) && {
-                said.push(f.hypothesis);
-                true
-            }
-        }));
-        self
+        let Finding { candidate, z, refused: Some(why), .. } = standing_out.max_by(|a, b| a.z.total_cmp(&b.z))? else { return None };
+        let ((most, what), label) = (&self.selection.remaining, candidate.label());
+        Some(format!("{DIFFER_FROM_MODEL}, most in {what} (z = {most:.1}); {label} stands out (z = {z:.1}) but was refused: {why}"))
     }
 
     /// The same with all claims refused for this reason; `said` says so.
@@ -103,14 +99,16 @@ impl Judgement {
         Self { verdict: Verdict::Unexplained, reason: said, ..self }
     }
 
-    /// The same without one of several claims, which is refused for this reason: the others are settled and sized again.
+    /// The same without one of its claims, which is refused for this reason: the others are settled and sized again.
     pub(crate) fn dropping(mut self, case: &Case<'_>, yardstick: &Yardstick, i: usize, why: String) -> Self {
         let dropped = self.selection.chosen[i];
         self.findings[i].refused = Some(why);
         let others = without(&self.selection.chosen, i);
         self.selection.choose(yardstick, &yardstick.group(case.condensed()), others);
         let left_out = self.findings.into_iter().filter(|f| f.refused.is_some()).collect();
-        unless_unrest(case, yardstick, concluded(case, yardstick, self.selection, self.onsets, &[dropped], left_out))
+        let judgement = concluded(case, yardstick, self.selection, self.onsets, &[dropped], left_out);
+        let reason = judgement.naming(&judgement.findings).unwrap_or_else(|| judgement.reason.clone());
+        unless_unrest(case, yardstick, Judgement { reason, ..judgement })
     }
 }
 
@@ -169,7 +167,10 @@ fn concluded(
         let dropped = findings.iter().rposition(|f| f.refused.is_some());
         match dropped {
             Some(i) if findings.len() > 1 => {
-                left_out.push(findings.remove(i));
+                let refused = findings.remove(i);
+                // What is refused again is listed once.
+                left_out.retain(|before| before.hypothesis != refused.hypothesis);
+                left_out.push(refused);
                 let others = without(&selection.chosen, i);
                 selection.choose(yardstick, &group, others);
             }

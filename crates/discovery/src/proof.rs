@@ -211,7 +211,7 @@ impl Trial<'_> {
     }
 
     fn resamples(&self) -> Resamples {
-        Resamples::draw(self.drives.len(), self.scoring.resamples, self.scoring.seed)
+        self.scoring.resamples_of(self.drives.len())
     }
 }
 

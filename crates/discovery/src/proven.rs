@@ -170,6 +170,13 @@ fn tried(
             0 => Vec::new(),
             _ => leave_each_out(fewer, case, &judgement, held.told),
         };
+        if yardstick.model_on_trial
+            && let Some(i) = held.last_contradicted(&judgement, &learned)
+        {
+            let why = "measurements of drives that were not fitted contradict one another no less with it";
+            judgement = judgement.dropping(case, yardstick, i, why.into());
+            continue;
+        }
         let score = |learned: &[Learned]| score_held_out(predictor, drives, maps, learned, &options.scoring, work);
         let mut scores = if drives.is_empty() { None } else { Some(score(&learned)?) };
         // What a sensor or the map is wrong by is no matter of the soil.
@@ -178,13 +185,6 @@ fn tried(
             held.seek_ground(case, &mut learned, &mut taught);
             held.stand_on_ground(case, &mut learned, &mut taught);
             scores = Some(HeldOut { another_ground: true, ..score(&learned)? });
-        }
-        let contradicted =
-            scores.as_ref().filter(|_| yardstick.model_on_trial).and_then(|s| held.last_contradicted(&judgement, &learned, s));
-        if let Some(i) = contradicted {
-            let why = "measurements of drives that were not fitted contradict one another no less with it";
-            judgement = judgement.dropping(case, yardstick, i, why.into());
-            continue;
         }
         let needless = match &scores {
             Some(scores) => {
@@ -237,7 +237,13 @@ impl<'a> HeldDrives<'a> {
 
     /// Position of the last claimed sensor that the measurements of the drives can tell of and do not: with it beside the other claims they do not surely contradict one
     /// another less. Predictions of a wrong model gain by it as by anything else that bends them.
-    fn last_contradicted(&self, judgement: &Judgement, learned: &[Learned], scores: &HeldOut) -> Option<usize> {
+    fn last_contradicted(&self, judgement: &Judgement, learned: &[Learned]) -> Option<usize> {
+        let is_sensor = |i: &usize| judgement.findings[*i].candidate.layer() == Layer::Sensor;
+        let sensors: Vec<usize> = judgement.claimed().into_iter().rev().filter(is_sensor).collect();
+        if sensors.is_empty() || self.drives.is_empty() {
+            return None;
+        }
+        let resamples = self.options.scoring.resamples_of(self.drives.len());
         let vehicle = &self.predictor.bundle().vehicle;
         let with = Contradictions::of(vehicle, self.drives, |d| learned[d].effects.as_slice());
         let speaks_against = |i: &usize| {
@@ -250,10 +256,9 @@ impl<'a> HeldDrives<'a> {
                 })
                 .collect();
             let without = Contradictions::of(vehicle, self.drives, |d| others[d].as_slice());
-            !without.changed(&with).is_empty() && !without.fall_surely(&with, 0.0, &scores.resamples)
+            !without.changed(&with).is_empty() && !without.fall_surely(&with, 0.0, &resamples)
         };
-        let mut sensors = judgement.claimed().into_iter().rev().filter(|i| judgement.findings[*i].candidate.layer() == Layer::Sensor);
-        sensors.find(speaks_against)
+        sensors.into_iter().find(speaks_against)
     }
 
     /// Fits the best soil without an effect through the physics, as the one beside effects is: what is compared with it must not be better for that.

@@ -52,9 +52,19 @@ pub(crate) fn pursue(
     (trial, told): (&Trial<'_>, bool),
 ) -> Result<Pursued, DiscoveryError> {
     let (mut known, mut refused): (Vec<Known>, Vec<Finding>) = (Vec::new(), Vec::new());
-    let alone = case.ground_alone.as_ref().filter(|_| !told).map(Ground::correction);
-    let first = alone.or_else(|| case.ground_alone.is_some().then(|| Ground::beside(case, &[]).correction()));
-    if first.map_or(Ok(false), |soil| take_ground(case, soil, &[], trial))? {
+    let taken = match &case.ground_alone {
+        None => false,
+        // Tried where it was fitted.
+        Some(alone) if !told => {
+            case.bench.ground = alone.correction();
+            case.bench.ground != SoilCorrection::NONE
+        }
+        Some(_) => {
+            let soil = Ground::beside(case, &[]).correction();
+            take_ground(case, soil, &[], trial)?
+        }
+    };
+    if taken {
         let left = look_beside(case, &[])?;
         yardstick = own_yardstick(case, &left, without)?;
     }

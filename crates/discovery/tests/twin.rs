@@ -29,7 +29,7 @@ fn value(found: &Diagnosis, name: &str) -> (f64, [f64; 2]) {
 fn property_every_stage_tells_how_far_it_is() {
     let bundle = bundle();
     let effects = [Effect::SteeringOffset(SteeringOffset { second: 0.08 })];
-    let drives: Vec<_> = (0..8).map(|i| drive(&format!("d{i}"), 500 + i, &effects, &bundle.default_soil)).collect();
+    let drives: Vec<_> = (0..8).map(|i| drive(&format!("d{i}"), 500 + i, &effects, &bundle.default_soil())).collect();
     let predictor = nesam_model::Predictor::new(std::sync::Arc::new(bundle)).unwrap();
     let told = std::sync::Mutex::new(Vec::<(String, usize, usize)>::new());
     let progress = |stage: &str, done: usize, total: usize| told.lock().unwrap().push((stage.into(), done, total));
@@ -103,7 +103,7 @@ fn property_nothing_is_claimed_without_an_effect() {
 #[test]
 fn property_sensors_that_wander_jump_or_drift_are_told() {
     let changed = |change: fn(usize, &mut nesam_physics::VehicleState<f64>)| {
-        let soil = bundle().default_soil;
+        let soil = bundle().default_soil();
         let mut drives: Vec<_> = (0..8).map(|i| drive(&format!("d{i}"), 800 + i, &[], &soil)).collect();
         for drive in &mut drives {
             drive.states.iter_mut().enumerate().for_each(|(k, state)| change(k, state));
@@ -126,7 +126,7 @@ fn property_sensors_that_wander_jump_or_drift_are_told() {
 /// they were, by a fifth.
 #[test]
 fn property_a_steering_that_turns_further_to_the_left_is_no_offset() {
-    let soil = bundle().default_soil;
+    let soil = bundle().default_soil();
     let mut drives: Vec<_> = (0..8).map(|i| drive(&format!("d{i}"), 860 + i, &[], &soil)).collect();
     for control in drives.iter_mut().flat_map(|drive| &mut drive.controls) {
         control.second /= if control.second > 0.0 { 1.2 } else { 1.0 };
@@ -140,7 +140,7 @@ fn property_a_steering_that_turns_further_to_the_left_is_no_offset() {
 /// Goal: a gyro that reads more in left turns is neither a bias nor a scale, nor both. Method: eight drives of 20 s whose yaw rates to the left are recorded a fifth larger.
 #[test]
 fn property_a_gyro_that_reads_more_to_the_left_is_no_bias() {
-    let soil = bundle().default_soil;
+    let soil = bundle().default_soil();
     let mut drives: Vec<_> = (0..8).map(|i| drive(&format!("d{i}"), 880 + i, &[], &soil)).collect();
     for state in drives.iter_mut().flat_map(|drive| &mut drive.states) {
         state.angular_velocity_rad_s[2] *= if state.angular_velocity_rad_s[2] > 0.0 { 1.2 } else { 1.0 };
@@ -176,7 +176,7 @@ fn property_a_hypothesis_that_the_reference_does_not_know_is_refused() {
     let text = written::WrittenText { id: "another".into(), ..plough().text().clone() };
     let options = nesam_discovery::Options { hypotheses: vec![Written::read(&text).unwrap()], ..options() };
     let bundle = bundle();
-    let drives = [drive("d", 1, &[], &bundle.default_soil)];
+    let drives = [drive("d", 1, &[], &bundle.default_soil())];
     let predictor = nesam_model::Predictor::new(std::sync::Arc::new(bundle)).unwrap();
     let error = nesam_discovery::diagnose(&predictor, &drives, &[Some(world())], &options, &|_, _, _| {}).unwrap_err().to_string();
     assert!(error.contains("another") && error.contains("--make-reference"), "{error}");
@@ -203,7 +203,7 @@ fn property_the_segment_in_which_an_effect_begins_does_not_count() {
     let predictor = nesam_model::Predictor::new(std::sync::Arc::new(bundle.clone())).unwrap();
     for onset_s in [10.0, 0.0] {
         let effects = [Effect::SteeringOffset(SteeringOffset { second: 0.1 })];
-        let drives: Vec<_> = (0..8).map(|i| drive_from(&format!("d{i}"), 510 + i, &effects, onset_s, &bundle.default_soil)).collect();
+        let drives: Vec<_> = (0..8).map(|i| drive_from(&format!("d{i}"), 510 + i, &effects, onset_s, &bundle.default_soil())).collect();
         let observed = observe_all(&predictor, &drives, &vec![Some(world()); drives.len()], &|_| {}).unwrap();
         let bench = Bench::new(&bundle, &judge_by.catalogue);
         let mut case = judge_by.case(bench, observed, &|_, _, _| {}).unwrap();
@@ -233,7 +233,7 @@ fn property_what_was_settled_through_the_physics_stands_without_each_drive() {
 fn property_what_takes_the_place_of_an_effect_brings_its_own_evidence() {
     let bundle = bundle();
     let effects = [Effect::SteeringOffset(SteeringOffset { second: 0.08 })];
-    let drives: Vec<_> = (0..8).map(|i| drive(&format!("d{i}"), 500 + i, &effects, &bundle.default_soil)).collect();
+    let drives: Vec<_> = (0..8).map(|i| drive(&format!("d{i}"), 500 + i, &effects, &bundle.default_soil())).collect();
     let judge_by = Judge::of(&bundle).unwrap();
     let predictor = nesam_model::Predictor::new(std::sync::Arc::new(bundle.clone())).unwrap();
     let observed = observe_all(&predictor, &drives, &vec![Some(world()); drives.len()], &|_| {}).unwrap();
@@ -257,7 +257,7 @@ fn property_what_takes_the_place_of_an_effect_brings_its_own_evidence() {
 fn property_every_chosen_effect_is_held_against_its_rivals() {
     let bundle = bundle();
     let effects = [Effect::SteeringOffset(SteeringOffset { second: 0.08 }), Effect::MapOffset(MapOffset { z_m: 0.08 })];
-    let drives: Vec<_> = (0..8).map(|i| drive(&format!("d{i}"), 500 + i, &effects, &bundle.default_soil)).collect();
+    let drives: Vec<_> = (0..8).map(|i| drive(&format!("d{i}"), 500 + i, &effects, &bundle.default_soil())).collect();
     let judge_by = Judge::of(&bundle).unwrap();
     let predictor = nesam_model::Predictor::new(std::sync::Arc::new(bundle.clone())).unwrap();
     let observed = observe_all(&predictor, &drives, &vec![Some(world()); drives.len()], &|_| {}).unwrap();
@@ -326,7 +326,7 @@ fn property_without_a_claim_the_free_form_stands_against_the_model_as_it_is() {
 /// Eight drives of the twin that lack something.
 fn lacking(effects: &[Effect], lack: impl Fn(&mut Trajectory)) -> Vec<Trajectory> {
     let bundle = bundle();
-    let mut drives: Vec<_> = (0..8).map(|i| drive(&format!("d{i}"), 500 + i, effects, &bundle.default_soil)).collect();
+    let mut drives: Vec<_> = (0..8).map(|i| drive(&format!("d{i}"), 500 + i, effects, &bundle.default_soil())).collect();
     for drive in &mut drives {
         lack(drive);
         if !drive.measured.attitude[0] {
@@ -403,7 +403,7 @@ fn property_a_reference_that_cannot_do_without_a_channel_says_so() {
 fn property_of_few_drives_nothing_is_claimed_of_the_model_itself() {
     let bundle = bundle();
     let effects = [Effect::SteeringOffset(SteeringOffset { second: 0.08 })];
-    let drives: Vec<_> = (0..7).map(|i| drive(&format!("d{i}"), 500 + i, &effects, &bundle.default_soil)).collect();
+    let drives: Vec<_> = (0..7).map(|i| drive(&format!("d{i}"), 500 + i, &effects, &bundle.default_soil())).collect();
     let predictor = nesam_model::Predictor::new(std::sync::Arc::new(bundle)).unwrap();
     let options = nesam_discovery::Options { against: Against::Physics, ..options() };
     let of = |count: usize| nesam_discovery::diagnose(&predictor, &drives[..count], &vec![Some(world()); count], &options, &|_, _, _| {});
@@ -427,7 +427,7 @@ fn property_of_few_drives_nothing_is_claimed_of_the_model_itself() {
 fn property_a_model_on_trial_is_proven_by_the_fitted_drives() {
     let bundle = bundle();
     let effects = [Effect::SteeringOffset(SteeringOffset { second: 0.08 })];
-    let of = |i: u64| drive(&format!("d{i:02}"), 500 + i, if i < 8 { &effects } else { &[] }, &bundle.default_soil);
+    let of = |i: u64| drive(&format!("d{i:02}"), 500 + i, if i < 8 { &effects } else { &[] }, &bundle.default_soil());
     let drives: Vec<_> = (0..11).map(of).collect();
     let predictor = nesam_model::Predictor::new(std::sync::Arc::new(bundle.clone())).unwrap();
     let fit_on = Some((0..8).map(|i| format!("d{i:02}")).collect());
@@ -448,7 +448,7 @@ fn property_a_model_on_trial_is_proven_by_the_fitted_drives() {
 /// logs fitted.
 #[test]
 fn property_what_wheel_speeds_tell_is_not_in_before() {
-    let logs = rover_logs(60, 300, &[Effect::SpeedGain(SpeedGain { relative: 0.6 })], &bundle().default_soil);
+    let logs = rover_logs(60, 300, &[Effect::SpeedGain(SpeedGain { relative: 0.6 })], &bundle().default_soil());
     let rover = ModelBundle { vehicle: rover(), reference_json: None, ..bundle() };
     let predictor = nesam_model::Predictor::new(std::sync::Arc::new(rover)).unwrap();
     let scoring = nesam_discovery::Scoring { horizon: 19, history: 1, ..options().scoring };
@@ -465,7 +465,7 @@ fn property_what_wheel_speeds_tell_is_not_in_before() {
 /// A drive without an effect, prepared, with its bundle.
 fn observed_drive(id: &str) -> (ModelBundle, Trajectory, ObservedDrive) {
     let bundle = bundle();
-    let recorded = drive(id, 42, &[], &bundle.default_soil);
+    let recorded = drive(id, 42, &[], &bundle.default_soil());
     let predictor = nesam_model::Predictor::new(std::sync::Arc::new(bundle.clone())).unwrap();
     let observed = observe(&predictor, &recorded, Some(&world())).unwrap();
     (bundle, recorded, observed)
@@ -495,7 +495,7 @@ fn property_without_an_effect_a_drive_driven_again_is_the_recording() {
 fn property_the_network_is_heard_over_the_ground_of_an_effect() {
     let mut bundle = bundle();
     bundle.weights = initial_weights(7, &bundle.normalization);
-    let recorded = drive("raised", 42, &[], &bundle.default_soil);
+    let recorded = drive("raised", 42, &[], &bundle.default_soil());
     let predictor = nesam_model::Predictor::new(std::sync::Arc::new(bundle.clone())).unwrap();
     let bench = Bench::new(&bundle, &[]);
     let rows = |lower_m: f64, effects: &[ScheduledEffect]| {
@@ -597,7 +597,7 @@ fn property_a_gyro_of_a_new_base_is_told_by_what_measurements_contradict() {
 /// base without an effect and of one that is faster than it is told.
 #[test]
 fn property_ground_that_no_map_tells_is_fitted_before_anything_is_named() {
-    let assumed = bundle().default_soil;
+    let assumed = bundle().default_soil();
     let firm = SoilCorrection { delta: [1.0, 0.0, 0.0, 0.5, 0.14, -0.9], ..SoilCorrection::NONE }.apply(&assumed);
     let errors = |found: &Diagnosis| -> [f64; 3] {
         let of = |score: &nesam_evaluation::ModelScore| score.summary.tree.mae_mean.yaw_deg.unwrap();
@@ -645,7 +645,7 @@ fn property_a_ramp_a_delay_and_a_limit_of_the_rims_are_told_apart() {
         60,
         300,
         &[Effect::SpeedDelay(delay), Effect::AccelerationLimit(ramp), Effect::WheelSpeedLimit(limit)],
-        &bundle().default_soil,
+        &bundle().default_soil(),
     );
     let found = diagnose_rover_beside(&[], &logs);
     for id in ["speed_delay", "acceleration_limit", "wheel_speed_limit"] {

@@ -165,8 +165,9 @@ impl Engine {
 
     /// The filter that a session begins with on a map: wider where no colours show what soil is where.
     fn filter_on(&self, map: Option<&str>) -> Result<&SoilFilter, EngineError> {
-        let sees_colours = map.map_or(Ok(true), |map| self.maps.get(map).map(|map| map.has_semantics()))?;
-        Ok(self.unseen_filter.as_ref().filter(|_| !sees_colours).unwrap_or(&self.filter))
+        let map = map.map(|map| self.maps.get(map)).transpose()?;
+        let unseen = map.and_then(|map| self.predictor.unseen_soil_sd(map));
+        Ok(unseen.and(self.unseen_filter.as_ref()).unwrap_or(&self.filter))
     }
 
     /// All the filters that a session can have begun with: a map may have come by its colours since.
@@ -188,11 +189,9 @@ impl Engine {
             return Err(EngineError::invalid("vehicle_card", reason));
         }
         let map = (!open.map.is_empty()).then_some(open.map.as_str());
-        if let Some(map) = map {
-            self.maps.get(map)?;
-        }
+        let filter = self.filter_on(map)?.clone();
         self.check_room("session_id", id, &open.vehicle)?;
-        let mut session = Session::new(id, &open.vehicle, map, self.filter_on(map)?.clone(), now_ns);
+        let mut session = Session::new(id, &open.vehicle, map, filter, now_ns);
         if self.watches() {
             session.begin_watch();
         }

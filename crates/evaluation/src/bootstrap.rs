@@ -40,35 +40,38 @@ impl Resamples {
 
     /// 95 % interval of the mean over windows. `rows` holds one value per window, `cluster` the drive of each window.
     ///
-    /// `None` where an interval would mean nothing: windows of fewer than two drives, or a value that is not finite.
+    /// Rows that are NaN are left out. `None` where an interval would mean nothing: windows of fewer than two drives, or a value that is infinite.
     pub fn mean_interval(&self, rows: &[f64], cluster: &[usize]) -> Option<[f64; 2]> {
-        let (mut sum, mut number) = (vec![0.0; self.clusters], vec![0.0; self.clusters]);
-        for (&value, &c) in rows.iter().zip(cluster) {
+        let (mut sum, mut number, mut kept) = (vec![0.0; self.clusters], vec![0.0; self.clusters], Vec::with_capacity(rows.len()));
+        for (&value, &c) in rows.iter().zip(cluster).filter(|(value, _)| !value.is_nan()) {
             sum[c] += value;
             number[c] += 1.0;
+            kept.push(c);
         }
-        self.interval(cluster, |weight| {
+        self.interval(&kept, |weight| {
             let pick = |per: &[f64]| -> f64 { per.iter().zip(weight).map(|(v, &w)| v * f64::from(w)).sum() };
             pick(&sum) / pick(&number)
         })
     }
 
-    /// 95 % interval of (mean of `over`) / (mean of `under`), both over the same windows; `None` as in [`Resamples::mean_interval`]. Resamples in which
-    /// nothing is to divide by are left out.
+    /// 95 % interval of (mean of `over`) / (mean of `under`), both over the same windows; rows of which one is NaN are left out, `None` as in
+    /// [`Resamples::mean_interval`]. Resamples in which nothing is to divide by are left out.
     pub fn ratio_interval(&self, over: &[f64], under: &[f64], cluster: &[usize]) -> Option<[f64; 2]> {
-        let mut sums = vec![[0.0; 2]; self.clusters];
-        for ((&above, &below), &c) in over.iter().zip(under).zip(cluster) {
+        let (mut sums, mut kept) = (vec![[0.0; 2]; self.clusters], Vec::with_capacity(over.len()));
+        for ((&above, &below), &c) in over.iter().zip(under).zip(cluster).filter(|((above, below), _)| !(above.is_nan() || below.is_nan()))
+        {
             sums[c][0] += above;
             sums[c][1] += below;
+            kept.push(c);
         }
-        self.interval(cluster, |weight| {
+        self.interval(&kept, |weight| {
             let pick = |which: usize| -> f64 { sums.iter().zip(weight).map(|(s, &w)| s[which] * f64::from(w)).sum() };
             let below = pick(1);
             if below > 0.0 { pick(0) / below } else { f64::NAN }
         })
     }
 
-    /// 95 % interval of the median over windows; arguments as [`Resamples::mean_interval`]. Rows that are NaN are left out.
+    /// 95 % interval of the median over windows; arguments as [`Resamples::mean_interval`].
     pub fn median_interval(&self, rows: &[f64], cluster: &[usize]) -> Option<[f64; 2]> {
         let mut sorted: Vec<(f64, usize)> = rows.iter().copied().zip(cluster.iter().copied()).filter(|(v, _)| !v.is_nan()).collect();
         sorted.sort_by(|a, b| a.0.total_cmp(&b.0));

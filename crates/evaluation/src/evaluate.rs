@@ -12,7 +12,7 @@ use crate::error::EvaluationError;
 use crate::errors::{PosePath, WindowErrors};
 use crate::models::ModelName;
 use crate::predictors::WindowPredictor;
-use crate::score::{ErrorSummary, mean_interval_told, mean_told, summarise};
+use crate::score::{ErrorSummary, mean_told, summarise};
 use crate::windows::{Truth, Window};
 
 /// What one model predicted for every window, in window order.
@@ -109,7 +109,7 @@ pub fn score(model: &ModelPaths, windows: &[Window<'_>], truth: Truth, resamples
 fn curve(errors: &WindowErrors, dimension: usize, resamples: &Resamples) -> HorizonCurve {
     let columns: Vec<Vec<f64>> = (0..errors.horizon).map(|k| errors.column(k, dimension)).collect();
     let mean = columns.iter().map(|c| mean_told(c)).collect();
-    let ci95 = columns.par_iter().filter_map(|c| mean_interval_told(c, &errors.trajectory, resamples)).collect();
+    let ci95 = columns.par_iter().filter_map(|c| resamples.mean_interval(c, &errors.trajectory)).collect();
     HorizonCurve { mean, ci95 }
 }
 

@@ -125,13 +125,6 @@ pub(crate) fn mean_told(values: &[f64]) -> f64 {
     sum / f64::from(count)
 }
 
-/// 95 % interval of the same, by the drives of the windows.
-pub(crate) fn mean_interval_told(values: &[f64], drives: &[usize], resamples: &Resamples) -> Option<[f64; 2]> {
-    let told = values.iter().zip(drives).filter(|(v, _)| !v.is_nan());
-    let (values, drives): (Vec<f64>, Vec<usize>) = told.map(|(v, drive)| (*v, *drive)).unzip();
-    resamples.mean_interval(&values, &drives)
-}
-
 fn finite(v: f64) -> Option<f64> {
     v.is_finite().then_some(v)
 }
@@ -151,7 +144,7 @@ pub fn summarise(errors: &WindowErrors, resamples: &Resamples) -> ErrorSummary {
     let ci95 = tree(std::array::from_fn(|s| {
         let rows = &c.values[s];
         let interval = |r: &[f64]| {
-            if s == RATIO { resamples.median_interval(r, &errors.trajectory) } else { mean_interval_told(r, &errors.trajectory, resamples) }
+            if s == RATIO { resamples.median_interval(r, &errors.trajectory) } else { resamples.mean_interval(r, &errors.trajectory) }
         };
         if c.present[s] { interval(rows) } else { None }
     }));
@@ -164,7 +157,7 @@ pub fn paired_difference(a: &WindowErrors, b: &WindowErrors, resamples: &Resampl
     let rows: Vec<Vec<f64>> = (0..STATISTICS).map(|s| ca.values[s].iter().zip(&cb.values[s]).map(|(x, y)| x - y).collect()).collect();
     let present = |s: usize| s != RATIO && ca.present[s] && cb.present[s];
     let difference = tree(std::array::from_fn(|s| if present(s) { finite(mean_told(&rows[s])) } else { None }));
-    let interval = tree(std::array::from_fn(|s| if present(s) { mean_interval_told(&rows[s], &a.trajectory, resamples) } else { None }));
+    let interval = tree(std::array::from_fn(|s| if present(s) { resamples.mean_interval(&rows[s], &a.trajectory) } else { None }));
     (difference, interval)
 }
 
@@ -172,12 +165,7 @@ pub fn paired_difference(a: &WindowErrors, b: &WindowErrors, resamples: &Resampl
 pub fn paired_ratio(a: &WindowErrors, b: &WindowErrors, resamples: &Resamples) -> ErrorTree<[f64; 2]> {
     let (ca, cb) = (columns(a), columns(b));
     let present = |s: usize| s != RATIO && ca.present[s] && cb.present[s];
-    let interval = |s: usize| {
-        let rows = ca.values[s].iter().zip(&cb.values[s]).zip(&a.trajectory).filter(|((x, y), _)| !(x.is_nan() || y.is_nan()));
-        let (rows, drives): (Vec<(f64, f64)>, Vec<usize>) = rows.map(|((x, y), drive)| ((*x, *y), *drive)).unzip();
-        let (over, under): (Vec<f64>, Vec<f64>) = rows.into_iter().unzip();
-        resamples.ratio_interval(&over, &under, &drives)
-    };
+    let interval = |s: usize| resamples.ratio_interval(&ca.values[s], &cb.values[s], &a.trajectory);
     tree(std::array::from_fn(|s| if present(s) { interval(s) } else { None }))
 }
 

@@ -70,7 +70,8 @@ impl Window<'_> {
 
     /// Length of the driven path, horizontal, m.
     pub fn path_m(&self, truth: Truth) -> f64 {
-        path_length_m(&self.true_start(truth), &self.truth(truth))
+        let poses = self.true_poses(truth, 0);
+        path_length_m(&poses[0], &poses[1..])
     }
 
     /// True poses from a step on.

@@ -82,7 +82,7 @@ pub fn read_bag(path: &Path, topics: &Topics) -> Result<(Log, Notes), ImportErro
     let places: Vec<usize> = begins.iter().map(|at| poses[*at].place).collect();
     let (of_commands, of_imu) = (begins_of(&told, &places), begins_of(&turned, &places));
     let has_gyro = gyro.is_some();
-    let apart_ns: Vec<Option<u64>> = (0..=begins.len()).map(|part| apart_ns(&part_of(&poses, &begins, part))).collect();
+    let apart_ns: Vec<Option<u64>> = (0..=begins.len()).map(|part| apart_ns(part_of(&poses, &begins, part))).collect();
     let least_ns = apart_ns.iter().flatten().min().copied().unwrap_or(0);
     let (mut rows, mut log_begins) = (Vec::new(), Vec::new());
     for part in 0..=begins.len() {
@@ -102,7 +102,6 @@ pub fn read_bag(path: &Path, topics: &Topics) -> Result<(Log, Notes), ImportErro
 }
 
 /// A message of a topic that is held between its messages.
-#[derive(Clone)]
 struct Received<T> {
     place: usize,
     recorded_ns: i64,
@@ -158,9 +157,9 @@ fn begins_of<T>(messages: &[Received<T>], places: &[usize]) -> Vec<usize> {
 }
 
 /// The messages of a part.
-fn part_of<T: Clone>(messages: &[Received<T>], begins: &[usize], part: usize) -> Vec<Received<T>> {
+fn part_of<'a, T>(messages: &'a [Received<T>], begins: &[usize], part: usize) -> &'a [Received<T>] {
     let from = part.checked_sub(1).map_or(0, |before| begins[before]);
-    messages[from..begins.get(part).copied().unwrap_or(messages.len())].to_vec()
+    &messages[from..begins.get(part).copied().unwrap_or(messages.len())]
 }
 
 /// How far the stamps of messages lie from when they were recorded, in the middle, ns; `None` where none has one.
@@ -175,14 +174,14 @@ fn of_another_clock(topic: &str) -> String {
 }
 
 /// The messages of a topic in the order of the instants from which they count.
-fn by_instant<T>(topic: &str, mut messages: Vec<Received<T>>, as_recorded: bool, notes: &mut Notes) -> Vec<(i64, T)> {
-    messages.iter_mut().for_each(|message| message.stamp_ns = message.stamp_ns.filter(|_| !as_recorded));
-    let foreign_clock = apart_ns(&messages).is_some_and(|ns| ns > CLOCKS_APART_NS);
+fn by_instant<T: Copy>(topic: &str, messages: &[Received<T>], as_recorded: bool, notes: &mut Notes) -> Vec<(i64, T)> {
+    let foreign_clock = !as_recorded && apart_ns(messages).is_some_and(|ns| ns > CLOCKS_APART_NS);
     if foreign_clock {
         notes.push(of_another_clock(topic));
     }
-    let instant = |message: &Received<T>| message.stamp_ns.filter(|_| !foreign_clock).unwrap_or(message.recorded_ns);
-    let mut entries: Vec<(i64, T)> = messages.into_iter().map(|message| (instant(&message), message.value)).collect();
+    let by_stamp = !(as_recorded || foreign_clock);
+    let instant = |message: &Received<T>| message.stamp_ns.filter(|_| by_stamp).unwrap_or(message.recorded_ns);
+    let mut entries: Vec<(i64, T)> = messages.iter().map(|message| (instant(message), message.value)).collect();
     entries.sort_by_key(|(ns, _)| *ns);
     entries
 }

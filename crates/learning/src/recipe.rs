@@ -112,8 +112,6 @@ pub fn run(
         train_at.extend(drives.len()..drives.len() + images.len());
         drives.extend(images);
     }
-    // Trained further without colours, a network sees what it is to lack them.
-    scales.stand_in = scales.stand_in.filter(|_| plan.steps == 0 || all_coloured(&drives, &train_at));
     let weights = stages.first_weights(&drives, &train_at, &mut scales)?;
     // Of encoders that were trained on nothing no drive is shown anything.
     if recipe.start.is_some() || any_mapped(&drives, &train_at) {
@@ -149,7 +147,6 @@ pub fn run(
         name: recipe.name.clone(),
         hash: String::new(),
         form: recipe.plan.objective.variant,
-        default_soil: scales.default_soil(),
         parameters: trained_parameters(&trained.weights, recipe.plan.objective.variant),
         vehicle,
         normalization: scales,
@@ -170,10 +167,11 @@ pub fn run(
             parent: recipe.start.as_ref().map(|bundle| bundle.hash.clone()),
         },
     };
-    if let Some(measured) = stand_in::measure(&bundle, &at(&drives, &train_at[..learned_from]))? {
-        bundle.normalization.stand_in = Some(measured);
+    let measured = stand_in::measure(&bundle, &at(&drives, &train_at[..learned_from]))?;
+    // Trained further without colours, a network has seen what it is to lack them.
+    if measured.is_some() || plan.steps > 0 {
+        bundle.normalization.stand_in = measured;
     }
-    bundle.default_soil = bundle.normalization.default_soil();
     bundle.save(&recipe.out.join("bundle"))?;
     Ok(bundle)
 }
@@ -340,11 +338,6 @@ pub fn load_drives(root: &DataRoot, trajectories: &[Trajectory]) -> Result<Vec<D
 /// Whether any of some drives has a map.
 fn any_mapped(drives: &[Drive], at: &[usize]) -> bool {
     at.iter().any(|&i| drives[i].map.is_some())
-}
-
-/// Whether all of some drives have maps with colours.
-fn all_coloured(drives: &[Drive], at: &[usize]) -> bool {
-    at.iter().all(|&i| drives[i].map.as_ref().is_some_and(|map| map.has_semantics()))
 }
 
 /// Mirror images of some drives; drives over one map share its image.

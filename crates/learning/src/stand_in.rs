@@ -15,7 +15,7 @@ use nesam_trajectories::{DataRoot, Trajectory};
 use rayon::prelude::*;
 
 use crate::drives::Drive;
-use crate::recipe::{is_validation, load_drives};
+use crate::recipe::load_drives;
 use crate::trainer::TrainingError;
 
 /// Samples from one pose to the next: a vehicle at 3 m/s is 6 m further on.
@@ -50,15 +50,13 @@ pub fn measure(bundle: &ModelBundle, drives: &[&Drive]) -> Result<Option<StandIn
     Ok((sums.poses > 0.0).then(|| sums.stand_in()))
 }
 
-/// The same along the drives of a training split that trained, all but those that validate.
+/// The same along drives of a data root.
 ///
 /// # Errors
 /// `TrainingError` when a map cannot be read, or as [`measure`].
-pub fn measure_on(bundle: &ModelBundle, root: &DataRoot, train_split: &[Trajectory]) -> Result<Option<StandIn>, TrainingError> {
-    let drives = load_drives(root, train_split)?;
-    let trained: Vec<&Drive> =
-        drives.iter().enumerate().filter(|(i, _)| !is_validation(*i, drives.len())).map(|(_, drive)| drive).collect();
-    Ok(measure(bundle, &trained)?)
+pub fn measure_on(bundle: &ModelBundle, root: &DataRoot, training: &[Trajectory]) -> Result<Option<StandIn>, TrainingError> {
+    let drives = load_drives(root, training)?;
+    Ok(measure(bundle, &drives.iter().collect::<Vec<_>>())?)
 }
 
 /// Sums over poses.

@@ -79,8 +79,6 @@ pub struct ModelBundle {
     pub vehicle: Vehicle,
     /// Effects on top of the vehicle card, as `effects.toml` lists them; [`ModelBundle::vehicle`] has them already.
     pub effects: Vec<ScheduledEffect>,
-    /// Soil used where there is no map or no semantics, order of `SOIL_NAMES`.
-    pub default_soil: [f64; SOIL_DIM],
     /// Trainable parameters of the kinodynamic model (without the frozen encoders).
     pub parameters: usize,
     /// Scales and trained ranges.
@@ -195,7 +193,6 @@ impl ModelBundle {
             form: manifest.model,
             vehicle: vehicle.with_effects(&begun(&effects)),
             effects,
-            default_soil: normalization.default_soil(),
             parameters: trained_parameters(&weights, manifest.model),
             normalization,
             weights,
@@ -243,6 +240,11 @@ impl ModelBundle {
         silent
     }
 
+    /// Soil where there is no map or no semantics, order of `SOIL_NAMES`.
+    pub fn default_soil(&self) -> [f64; SOIL_DIM] {
+        self.normalization.default_soil()
+    }
+
     /// The bundle with another soil where a map tells of none.
     pub fn on_soil(&self, soil: &[f64; SOIL_DIM]) -> Self {
         let mut on_soil = self.clone();
@@ -261,7 +263,7 @@ impl ModelBundle {
     }
 
     /// Puts the bundle's effects on another vehicle. What was measured of the bundle's own vehicle does not hold for one that the bundle is not of, and is
-    /// dropped: fitted baselines, the reference of diagnoses, the settings of the soil filter and the covariance of errors.
+    /// dropped: fitted baselines, the reference of diagnoses, the settings of the soil filter, the covariance of errors and the ground that stands in for unseen one.
     pub fn move_to(&mut self, vehicle: &Vehicle) {
         if !self.is_of(vehicle) {
             self.baselines_json = None;
@@ -269,6 +271,7 @@ impl ModelBundle {
             self.reference_drives = None;
             self.soil_filter_json = None;
             self.rollout_noise_json = None;
+            self.normalization.stand_in = None;
         }
         self.vehicle = vehicle.with_effects(&begun(&self.effects));
     }
@@ -334,19 +337,20 @@ mod tests {
         };
         let measured = |bundle: &ModelBundle| {
             let texts = [&bundle.baselines_json, &bundle.soil_filter_json, &bundle.rollout_noise_json].map(|text| text.is_some());
-            (texts, [bundle.reference_json.is_some(), bundle.reference_drives.is_some()])
+            let of_drives = [bundle.reference_json.is_some(), bundle.reference_drives.is_some(), bundle.normalization.stand_in.is_some()];
+            (texts, of_drives)
         };
         let (mut car, robot) = (shipped("hmmwv-nominal"), shipped("clearpath-husky"));
         let own = car.vehicle.clone();
         car.move_to(&own);
-        assert_eq!(measured(&car), ([true; 3], [true; 2]), "its own vehicle changes nothing");
+        assert_eq!(measured(&car), ([true; 3], [true; 3]), "its own vehicle changes nothing");
         let mut otherwise = own.clone();
         otherwise.second = robot.vehicle.second;
         for another in [&robot.vehicle, &otherwise] {
             let mut moved = car.clone();
             moved.move_to(another);
             assert!(!car.is_of(another) && moved.is_of(another));
-            assert_eq!(measured(&moved), ([false; 3], [false; 2]));
+            assert_eq!(measured(&moved), ([false; 3], [false; 3]));
         }
     }
 }

@@ -15,16 +15,14 @@
 //! parameters.fade = { value = 0.2, unit = "m/s", range = [0.05, 1.0] }
 //! ```
 
-use std::collections::{BTreeMap, BTreeSet};
+use std::collections::BTreeMap;
 
 use nesam_physics::effects::written::{WRITTEN_MAX, WrittenParameter, WrittenText};
-use nesam_physics::effects::{Effect, PLACES_MAX, Scaling, ScheduledEffect, Written};
+use nesam_physics::effects::{Effect, ScheduledEffect, Written, places_at_fault};
 use serde::{Deserialize, Serialize};
 
 /// Version of the file; absent in files without effects.
 const FORMAT: &str = "nesam.effects/1";
-/// Effects that act at a place of their own, each of them.
-const LISTED: [&str; 3] = ["soil_drift", "soil_crust", "free_form"];
 /// The text of a bundle without effects.
 const NONE: &str = "# Effects found by `nesam diagnose`; none yet.\neffects = []\n";
 
@@ -136,22 +134,11 @@ pub fn read(text: &str) -> Result<Vec<ScheduledEffect>, String> {
         return Err(format!("has two written effects `{}` that differ", twice.id()));
     }
     let named: Vec<ScheduledEffect> = file.effects.iter().map(effect).collect::<Result<_, _>>()?;
-    for id in LISTED {
-        let places = places_of(&named, id);
-        if places > PLACES_MAX {
-            return Err(format!("has `{id}` at {places} places; {PLACES_MAX} can act at once"));
-        }
+    let plain: Vec<Effect> = named.iter().map(|e| e.effect).collect();
+    if let Some(fault) = places_at_fault(&plain) {
+        return Err(fault);
     }
     Ok(named.into_iter().chain(written).collect())
-}
-
-/// Number of different places (what scaling holds) at which effects of an id act.
-fn places_of(effects: &[ScheduledEffect], id: &str) -> usize {
-    let held = |e: &ScheduledEffect| -> Vec<u64> {
-        let of = e.effect.quantities().iter().zip(e.effect.values());
-        of.filter(|(q, _)| q.scaling == Scaling::Held).map(|(_, value)| value.to_bits()).collect()
-    };
-    effects.iter().filter(|e| e.effect.id() == id).map(held).collect::<BTreeSet<_>>().len()
 }
 
 /// The text of a list of effects, as [`read`] reads it.
@@ -210,7 +197,7 @@ fn onset(id: &str, onset_s: f64) -> Result<f64, String> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use nesam_physics::effects::{Payload, SoilDrift, SteeringOffset, WheelDrag};
+    use nesam_physics::effects::{PLACES_MAX, Payload, SoilDrift, SteeringOffset, WheelDrag};
 
     #[test]
     fn property_effects_round_trip_bit_for_bit() {

@@ -253,7 +253,7 @@ impl Predictor {
     /// an onlooker can ask while others predict.
     pub fn known_soil_prior(&self, map: Option<&Arc<WorldMap>>, pose: Pose2) -> Option<[f64; SOIL_DIM]> {
         let Some(map) = map.filter(|map| map.has_semantics()) else {
-            return Some(from_raw(self.bundle.normalization.unseen_soil_raw()));
+            return Some(self.bundle.default_soil());
         };
         self.held_tokens(map)?.known(&pose).map(|token| from_raw(&raw_soil(&token)))
     }

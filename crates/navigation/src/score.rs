@@ -122,11 +122,11 @@ pub fn summarise(runs: &[Run], configuration: &str, soil: Option<SoilKind>) -> O
         completion,
         completion_ci95: wilson(completion, chosen.len()),
         time_s: figures(&completed, |lap| Some(lap.time_s)),
-        hausdorff_m: figures(&begun, |lap| lap.hausdorff_m),
+        hausdorff_m: figures(&chosen, |lap| lap.hausdorff_m),
         hausdorff_whole_path_m: figures(whole, |lap| lap.hausdorff_whole_path_m),
-        off_path_m: figures(&begun, |lap| lap.off_path_mean_m),
-        roll_deg: figures(&begun, |lap| lap.roll_deg),
-        pitch_deg: figures(&begun, |lap| lap.pitch_deg),
+        off_path_m: figures(&chosen, |lap| lap.off_path_mean_m),
+        roll_deg: figures(&chosen, |lap| lap.roll_deg),
+        pitch_deg: figures(&chosen, |lap| lap.pitch_deg),
     })
 }
 

@@ -98,6 +98,9 @@ impl<T: Real> CommandPath<T> {
         take(now, 0.0, f64::INFINITY);
         for (steps, pair) in self.sent.iter().enumerate() {
             let end_s = -(steps as f64) * dt_s;
+            if end_s <= from_s {
+                break;
+            }
             take(pair[channel], if steps + 1 == SENT { f64::NEG_INFINITY } else { end_s - dt_s }, end_s);
         }
         sum

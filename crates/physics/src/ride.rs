@@ -78,9 +78,8 @@ fn ride(vehicle: &Vehicle, effects: EffectTerms, dt_s: f64, substeps: usize, soi
     let model = StepModel::new(vehicle, dt_s, substeps);
     let speed_m_s = SPEED_SHARE * vehicle.command_range[0][1];
     let control = Control { speed_m_s, second: 0.0 };
-    let axles_m = vehicle.wheel_centre_m.iter().map(|at| at[2]).sum::<f64>() / WHEELS as f64;
     let mut state = VehicleState::zero();
-    state.position_m[2] = vehicle.wheel_radius_m - axles_m;
+    state.position_m[2] = vehicle.standing_height_m();
     state.velocity_m_s[0] = speed_m_s;
     let mut actuators = DrivelineState::settled(&control);
     for _ in 0..(SETTLED_S / dt_s).ceil() as usize {

@@ -108,11 +108,11 @@ impl RigidBody {
         m * (if i == j { dot(r, r) } else { 0.0 } - r[i] * r[j])
     }
 
-    /// Whether a body can be so: a mass, and an inertia about the centre of mass that is positive definite.
+    /// Whether a body can be so: an inertia about the centre of mass that is positive definite.
     pub(crate) fn is_physical(&self) -> bool {
         let (m, c) = (self.mass_kg, self.centre_m);
         let about_centre = core::array::from_fn(|i| core::array::from_fn(|j| self.inertia_kg_m2[i][j] - Self::of_point(m, c, i, j)));
-        self.mass_kg > 0.0 && is_positive_definite(&about_centre)
+        is_positive_definite(&about_centre)
     }
 
     pub(crate) fn new(vehicle: &Vehicle) -> Self {

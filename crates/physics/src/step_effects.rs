@@ -139,6 +139,10 @@ impl StepModel {
     #[cold]
     #[inline(never)]
     pub(crate) fn damp_by_drag<T: Real>(&self, velocity_m_s: Vec3<T>, h: T, lhs: &mut [[T; 6]; 6]) {
+        let terms = &self.vehicle.effects.force;
+        if [terms.linear_drag_n_s_m, terms.quadratic_drag_n_s2_m2] == [0.0; 2] {
+            return;
+        }
         let damping = (h * self.drag_n_s_m(velocity_m_s) - T::lit(self.body.mass_kg)).max(T::lit(0.0));
         for (axis, row) in lhs.iter_mut().enumerate().take(3) {
             row[axis] = row[axis] + damping;
@@ -178,7 +182,7 @@ impl StepModel {
         let rim = input.wheels.rim_speed_m_s(i, followed, state.velocity_m_s[0]);
         match effects.force.radius_relative[i / 2] {
             0.0 => rim,
-            _ => rim + (self.resized_servo_m_s(i, input) - input.wheels.servo_m_s(i)),
+            relative => rim + input.wheels.servo_m_s(i) * T::lit(relative),
         }
     }
 

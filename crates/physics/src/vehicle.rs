@@ -247,6 +247,11 @@ pub struct Vehicle {
 }
 
 impl Vehicle {
+    /// Height of the reference point of a vehicle that stands on level ground, m: its springs at rest.
+    pub fn standing_height_m(&self) -> f64 {
+        self.wheel_radius_m - self.wheel_centre_m.iter().map(|centre| centre[2]).sum::<f64>() / WHEELS as f64
+    }
+
     /// Static load of each wheel on flat ground, N: the share of the weight that balances the moments of the axles, half to each side.
     pub fn static_load_n(&self) -> [f64; WHEELS] {
         let [front, rear] = [0, 2].map(|i| self.wheel_centre_m[i][0]);

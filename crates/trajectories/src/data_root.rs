@@ -281,7 +281,7 @@ impl DataRoot {
         Err(TrajectoryError::Query { set: query.set.clone(), reason })
     }
 
-    fn set_dir(&self, set: &str) -> Result<PathBuf, TrajectoryError> {
+    pub(crate) fn set_dir(&self, set: &str) -> Result<PathBuf, TrajectoryError> {
         let plain = !set.is_empty() && set.split('/').all(is_plain_name);
         let dir = self.root.join(set);
         if plain && dir.join(SAMPLES).is_file() {

@@ -8,7 +8,7 @@ use nesam_proto::etcd as pb;
 use pb::request_op::Request;
 use tonic::Status;
 
-use super::{Cluster, ENGINE_WAIT, Held, Stage, created, delete};
+use super::{Cluster, Held, Stage, created, delete};
 use crate::store::Key;
 
 /// Time for which a session stays at least, so that two askers do not tear at it.
@@ -111,8 +111,9 @@ impl Cluster {
     /// Takes a session out of the engine. It is not held any more, so nothing that the store does from now on changes what is stored of it.
     pub(super) async fn forget(&self, session: &str) {
         self.0.keeper.forget(session);
-        // A name that was only claimed is not in the engine. One that has no room for a command has the session still, which another server has too.
-        while let Err(EngineError::Overloaded { .. } | EngineError::Expired) = self.0.engine.close(session, ENGINE_WAIT).await {
+        // A name that was only claimed is not in the engine. One that has no room for a command has the session still, which another server has too. What it has taken
+        // it executes: asked twice, it would close one that has come back.
+        while let Err(EngineError::Overloaded { .. }) = self.0.engine.close(session, Duration::MAX).await {
             tokio::time::sleep(CLOSE_AGAIN).await;
         }
         self.0.keeper.forgotten(session);

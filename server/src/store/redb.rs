@@ -3,10 +3,7 @@
 use std::io::Read as _;
 use std::path::Path;
 
-use ::redb::{
-    AccessGuard, Database, DatabaseError, Durability, ReadTransaction, ReadableDatabase as _, ReadableTable as _, StorageError,
-    TableDefinition,
-};
+use ::redb::{Database, DatabaseError, Durability, ReadTransaction, ReadableDatabase as _, ReadableTable as _, TableDefinition};
 
 use super::{Change, Contents, SessionStore, StoreError, StoredSession, StoredSoil};
 
@@ -165,7 +162,6 @@ fn write(database: &Database, changes: &[Change]) -> Result<(), StoreError> {
     transaction.set_durability(Durability::Immediate).map_err(failed)?;
     {
         let mut sessions = transaction.open_table(SESSIONS).map_err(failed)?;
-        let mut set_aside = transaction.open_table(SET_ASIDE).map_err(failed)?;
         let mut maps = transaction.open_table(MAPS).map_err(failed)?;
         let mut soil = transaction.open_table(SOIL).map_err(failed)?;
         for change in changes {
@@ -175,6 +171,7 @@ fn write(database: &Database, changes: &[Change]) -> Result<(), StoreError> {
                 }
                 Change::SetAside(name) => {
                     if let Some(held) = sessions.remove(name.as_str()).map_err(failed)? {
+                        let mut set_aside = transaction.open_table(SET_ASIDE).map_err(failed)?;
                         let (saved_unix_ns, image) = held.value();
                         drop(set_aside.insert((name.as_str(), saved_unix_ns), image).map_err(failed)?);
                     }
@@ -201,13 +198,13 @@ impl RedbStore {
     /// # Errors
     /// `StoreError` when they cannot be read.
     pub fn set_aside(&self) -> Result<Vec<StoredSession>, StoreError> {
-        let entries = self.read()?.open_table(SET_ASIDE).map_err(failed)?;
-        let session = |entry: Result<_, StorageError>| {
-            let (key, image): (AccessGuard<'_, (&str, i64)>, AccessGuard<'_, &[u8]>) = entry.map_err(failed)?;
+        let (transaction, mut held) = (self.read()?, Vec::new());
+        for entry in transaction.open_table(SET_ASIDE).map_err(failed)?.iter().map_err(failed)? {
+            let (key, image) = entry.map_err(failed)?;
             let (name, saved_unix_ns) = key.value();
-            Ok(StoredSession { name: name.into(), saved_unix_ns, image: image.value().to_vec() })
-        };
-        entries.iter().map_err(failed)?.map(session).collect()
+            held.push(StoredSession { name: name.into(), saved_unix_ns, image: image.value().to_vec() });
+        }
+        Ok(held)
     }
 }
 

@@ -88,8 +88,8 @@ pub(crate) fn restore(contents: &Contents, engine: &EngineHandle, soil_of: Optio
 
 /// Whether the session is sound as far as is known, and this server the wrong one.
 fn is_of_another_server(error: &EngineError) -> bool {
-    use EngineError::{Exhausted, Expired, ForeignImage, Overloaded, Stopped};
-    matches!(error, ForeignImage { .. } | Exhausted { .. } | Overloaded { .. } | Expired | Stopped)
+    use EngineError::{Exhausted, ForeignImage, Overloaded, Stopped};
+    matches!(error, ForeignImage { .. } | Exhausted { .. } | Overloaded { .. } | Stopped)
 }
 
 /// A stored session as it goes on where its vehicle is now: the time without a server counts as silence.

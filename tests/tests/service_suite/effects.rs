@@ -110,6 +110,13 @@ async fn service_effects_outside_the_catalogue_are_refused() {
             vec![effect("payload", &[("mass_kg", -500.0, 0.0), ("x_m", 0.0, 0.0), ("y_m", 0.0, 0.0), ("z_m", 0.0, 0.0)]); 6],
             "effects",
         ),
+        (
+            "too many places",
+            (0..5)
+                .map(|i| effect("soil_drift", &[("factor_end", 0.9, 0.0), ("begin_s", f64::from(i), 0.0), ("end_s", 50.0, 0.0)]))
+                .collect(),
+            "effects",
+        ),
         ("too many", vec![both()[1].clone(); 17], "effects"),
         ("none", vec![], "effects"),
     ];

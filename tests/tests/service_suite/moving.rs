@@ -59,7 +59,11 @@ fn property_whatever_a_session_accepted_can_be_imported() {
     let position_m = limits.position_max_m;
     // Of each entry of a state: its limit, which the first two share with what is on the map.
     let angle_rad = core::f64::consts::PI + 1e-6;
-    let most = [position_m, position_m, position_m, angle_rad, angle_rad, 1e4, 100.0, 100.0, 100.0, 50.0, 50.0, 50.0];
+    let ([speed_m_s, rate_rad_s], yaw_rad) = ([limits.speed_max_m_s, limits.angular_speed_max_rad_s], 1e4);
+    let most = [
+        position_m, position_m, position_m, angle_rad, angle_rad, yaw_rad, speed_m_s, speed_m_s, speed_m_s, rate_rad_s, rate_rad_s,
+        rate_rad_s,
+    ];
     let engine = || {
         let mut engine = Engine::new(predictor(), limits.clone()).unwrap();
         engine.execute(0, &Command::PutMap { map: recorded.world.clone(), base: None }).unwrap();

@@ -27,7 +27,9 @@ use crate::bundle_path::bundle_dir;
 use crate::failure::{Failure, OrFail};
 use crate::output::{note, say};
 use crate::progress::Progress;
-use crate::sources::{Drives, check_own_vehicle, load_bundle, load_bundle_for, predictor_for, query, read_drives, validation_drives};
+use crate::sources::{
+    Drives, check_model_step, check_own_vehicle, load_bundle, load_bundle_for, parted_drives, predictor_for, read_drives,
+};
 use crate::{interrupt, output};
 
 /// Options of `nesam adapt`.
@@ -287,15 +289,15 @@ fn disguise(drives: &mut Drives, look: DisguiseArg, seed: u64) -> Result<(), Fai
 fn calibrate(args: &AdaptArgs) -> Result<(), Failure> {
     interrupt::exit_on_ctrl_c("the bundle is unchanged");
     let dir = bundle_dir(args.bundle.bundle.as_deref())?;
-    let drives = validation_drives(&args.data, "--calibrate", "the noise is estimated")?;
+    let mut given = settings_file(args.filter.as_deref())?;
+    let (drives, training) = parted_drives(&args.data, "--calibrate", "the noise is estimated")?;
     let mut bundle = load_bundle(Some(&dir))?;
     check_own_vehicle(&bundle, &drives.root, "--calibrate")?;
-    let train_split = drives.root.load_set(&query(&args.data, &drives.set, SplitArg::Train, false)).or_input()?;
-    if let Some(measured) = stand_in::measure_on(&bundle, &drives.root, &train_split).or_input()? {
+    check_model_step(&bundle, args.data.dt)?;
+    if let Some(measured) = stand_in::measure_on(&bundle, &drives.root, &training).or_input()? {
         bundle.normalization.stand_in = Some(measured);
     }
     let predictor = predictor_for(bundle.clone(), &drives.root, args.data.dt)?;
-    let mut given = settings_file(args.filter.as_deref())?;
     given.tail_dof.get_or_insert(TAIL_DOF);
     let prior_sd = *given.prior_sd.get_or_insert(PRIOR_SD);
     given.process_sd.get_or_insert(FilterConfig::process_sd_of(&prior_sd));

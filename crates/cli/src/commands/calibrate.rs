@@ -331,16 +331,15 @@ fn with_bundle(mut document: Value, bundle: Option<&Path>, provenance: nesam_eva
 
 /// Writes a bundle with another card; what was measured with the old one is left out.
 fn save_bundle(base: &ModelBundle, vehicle: &Vehicle, data_hash: &str, to: &Path) -> Result<PathBuf, Failure> {
-    let same_vehicle = base.is_of(vehicle);
+    let mut moved = base.clone();
+    moved.move_to(vehicle);
     let mut bundle = ModelBundle {
-        vehicle: vehicle.clone(),
-        baselines_json: base.baselines_json.clone().filter(|_| same_vehicle),
         reference_json: None,
         reference_drives: None,
         soil_filter_json: None,
         rollout_noise_json: None,
         provenance: derived_from(base, data_hash),
-        ..base.clone()
+        ..moved
     };
     let path = bundle.save(to).or_failed()?;
     say!("bundle {} ({}) in {}", bundle.name, &bundle.hash[..12], path.display());

@@ -4,7 +4,7 @@ use std::path::{Path, PathBuf};
 
 use clap::Args;
 use nesam_evaluation::Baselines;
-use nesam_import::{Doubt, card_doubts, doubts, read_recorded, recorded_doubts};
+use nesam_import::{Doubt, card_doubts, doubts, recorded_doubts};
 use nesam_model::bundle::MANIFEST;
 use nesam_model::{ModelBundle, Predictor};
 use nesam_trajectories::DataRoot;
@@ -177,7 +177,7 @@ fn check_set(root: &DataRoot, set: &str, findings: &mut Findings) {
     };
     let samples: usize = drives.iter().map(|d| d.states.len()).sum();
     findings.note(format!("set {set}: {} drives, {samples} samples at {} s", drives.len(), args.dt));
-    let recorded = match read_recorded(&root.path().join(set).join("samples.parquet")) {
+    let recorded = match root.recorded(set) {
         Ok(recorded) => recorded,
         Err(e) => return findings.error(format!("set {set}: {}", chain(&e))),
     };

@@ -9,8 +9,7 @@ use std::sync::{Mutex, MutexGuard, PoisonError};
 
 use clap::{Args, ValueEnum};
 use nesam_import::{
-    CONVERT, Drive, FrameConvention, Mapping, Options, Topics, doubts, drives, read_bag, read_csv, read_recorded, recorded_doubts,
-    write_set,
+    CONVERT, Drive, FrameConvention, Mapping, Options, Topics, doubts, drives, read_bag, read_csv, recorded_doubts, write_set,
 };
 use nesam_trajectories::{DataRoot, SetQuery, Trajectory, read_vehicle_card};
 
@@ -282,7 +281,7 @@ fn judge(args: &ImportArgs, card: Option<&Path>, draft: &Draft) -> Result<(), Fa
     for note in root.notes().iter().filter(|note| args.world.is_some() || of_card.contains(note)) {
         say!("  note: {note}");
     }
-    let recorded = read_recorded(&draft.root().join(&args.set).join("samples.parquet")).or_input()?;
+    let recorded = root.recorded(&args.set).or_input()?;
     for doubt in recorded_doubts(&recorded).into_iter().chain(doubts(&drives, root.vehicle())) {
         say!("  doubt: {}; {}", doubt.what, doubt.advice);
     }

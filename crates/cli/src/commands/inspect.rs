@@ -54,7 +54,7 @@ pub fn run(args: &InspectArgs) -> Result<(), Failure> {
 
 fn bundle(path: &Path) -> Result<Value, Failure> {
     let bundle = ModelBundle::load(path).or_input()?;
-    let soil: Map<String, Value> = SOIL_NAMES.iter().zip(bundle.default_soil).map(|(k, v)| ((*k).into(), json!(v))).collect();
+    let soil: Map<String, Value> = SOIL_NAMES.iter().zip(bundle.default_soil()).map(|(k, v)| ((*k).into(), json!(v))).collect();
     let p = &bundle.provenance;
     Ok(json!({
         "schema": "nesam.inspect/1",

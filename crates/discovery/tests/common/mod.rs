@@ -159,7 +159,6 @@ pub fn bundle() -> ModelBundle {
                 hash: "0".repeat(64),
                 vehicle: truck(),
                 effects: Vec::new(),
-                default_soil: scales.default_soil(),
                 parameters: 0,
                 form: Variant::Full,
                 weights,
@@ -185,7 +184,7 @@ pub fn bundle() -> ModelBundle {
 
 /// Drives without an effect, with their maps.
 fn null_drives(bundle: &ModelBundle) -> (Vec<Trajectory>, Vec<Option<Arc<WorldMap>>>) {
-    let drives: Vec<Trajectory> = (0..24).map(|i| drive(&format!("null{i:02}"), 100 + i, &[], &bundle.default_soil)).collect();
+    let drives: Vec<Trajectory> = (0..24).map(|i| drive(&format!("null{i:02}"), 100 + i, &[], &bundle.default_soil())).collect();
     let maps = vec![Some(world()); drives.len()];
     (drives, maps)
 }
@@ -221,7 +220,7 @@ pub fn diagnose_twin(effects: &[Effect], seed: u64, options: &Options) -> Diagno
 
 /// The same with effects that begin `onset_s` after the start.
 pub fn diagnose_from(effects: &[Effect], onset_s: f64, seed: u64, options: &Options) -> Diagnosis {
-    let soil = bundle().default_soil;
+    let soil = bundle().default_soil();
     let drives: Vec<Trajectory> = (0..8).map(|i| drive_from(&format!("d{i}"), seed + i, effects, onset_s, &soil)).collect();
     diagnose_drives(&drives, options)
 }
@@ -304,7 +303,7 @@ fn rover_log(id: &str, seed: u64, effects: &[Effect], soil: &[f64; SOIL_DIM]) ->
 
 /// The model of a rover on trial by logs of one with effects.
 pub fn diagnose_rover(effects: &[Effect]) -> Diagnosis {
-    diagnose_rover_on(&bundle().default_soil, effects)
+    diagnose_rover_on(&bundle().default_soil(), effects)
 }
 
 /// The same of one that drove on another soil than the model assumes.

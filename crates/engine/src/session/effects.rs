@@ -78,25 +78,28 @@ impl Acting {
         let named: Vec<(ScheduledEffect, AppliedEffect)> =
             applied.effects.iter().enumerate().map(|(i, effect)| checked(i, effect)).collect::<Result<_, _>>()?;
         let effects: Vec<ScheduledEffect> = named.iter().map(|(effect, _)| *effect).collect();
-        let bundle = base.bundle();
-        let all: Vec<ScheduledEffect> = bundle.effects.iter().chain(&effects).copied().collect();
-        bundle.vehicle.check_effects(&all, bundle.normalization.dt_s).map_err(|reason| EngineError::invalid("effects", reason))?;
         let in_order: Vec<AppliedEffect> = named.into_iter().map(|(_, effect)| effect).collect();
         let uncertain = in_order.iter().flat_map(|effect| &effect.parameters).filter(|p| p.sd > 0.0).count();
         if uncertain > UNCERTAIN_MAX {
             let reason = format!("have {uncertain} parameters with a standard deviation, at most {UNCERTAIN_MAX} are allowed");
             return Err(EngineError::invalid("effects", reason));
         }
+        let with = |effects: &[ScheduledEffect]| {
+            let predictor = base.with_effects(effects);
+            let bundle = predictor.bundle();
+            let checked = bundle.vehicle.check_effects(&bundle.effects, bundle.normalization.dt_s);
+            checked.map_err(|reason| EngineError::invalid("effects", reason)).map(|()| predictor)
+        };
         let mut shifted = Vec::new();
         for (i, effect) in in_order.iter().enumerate() {
             for uncertain in effect.parameters.iter().filter(|p| p.sd > 0.0) {
                 let mut moved = effects.clone();
                 moved[i] = one_off(i, effect, uncertain)?;
-                shifted.push(base.with_effects(&moved));
+                shifted.push(with(&moved)?);
             }
         }
         let applied = AppliedEffects { source: applied.source.clone(), effects: in_order };
-        Ok(Some(Arc::new(Self { applied, predictor: base.with_effects(&effects), shifted })))
+        Ok(Some(Arc::new(Self { applied, predictor: with(&effects)?, shifted })))
     }
 
     /// The effects.

@@ -1,13 +1,8 @@
 //! Whether a vehicle card makes sense.
 
-use nesam_physics::{SecondCommand, Vehicle, WHEELS};
+use nesam_physics::{SecondCommand, Vehicle};
 
 use super::{Doubt, doubt};
-
-/// Height of the centre of gravity of a vehicle that stands on level ground, m: its springs at rest.
-pub fn standing_height_m(vehicle: &Vehicle) -> f64 {
-    vehicle.wheel_radius_m - vehicle.wheel_centre_m.iter().map(|centre| centre[2]).sum::<f64>() / WHEELS as f64
-}
 
 /// Share of the mass by which its parts may weigh more: numbers of cards are rounded (chosen).
 const ROUNDED: f64 = 0.001;
@@ -83,7 +78,7 @@ pub fn card_doubts(vehicle: &Vehicle, mass_of_parts_kg: Option<f64>) -> Vec<Doub
     found.extend(about("the lag of the steering", vehicle.driveline.steering_lag_s, [0.0, 2.0], "s"));
     found.extend(steepest_rad(vehicle).and_then(|(what, angle_rad)| about(what, angle_rad, [0.0, 1.3], "rad")));
     found.extend(about("gravity", vehicle.gravity_m_s2, [9.7, 9.9], "m/s²"));
-    found.extend(about("the height of the centre of gravity over the ground", standing_height_m(vehicle), [0.02, 3.0], "m"));
+    found.extend(about("the height of the centre of gravity over the ground", vehicle.standing_height_m(), [0.02, 3.0], "m"));
     let mut moments: [f64; 3] = core::array::from_fn(|axis| vehicle.inertia_kg_m2[axis][axis]);
     moments.sort_by(f64::total_cmp);
     if moments[2] > 1.001 * (moments[0] + moments[1]) {

@@ -23,7 +23,7 @@ use std::ops::Range;
 use nesam_physics::{Vehicle, WHEELS, wrap_angle};
 use nesam_trajectories::Trajectory;
 
-pub use card::{card_doubts, standing_height_m};
+pub use card::card_doubts;
 pub use recorded::recorded_doubts;
 
 /// Samples of a stretch: a second at 10 Hz (chosen: longer than poses freeze in sound logs, shorter than most motions last).

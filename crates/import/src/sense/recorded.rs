@@ -2,8 +2,9 @@
 
 use std::ops::Range;
 
+use nesam_trajectories::Recorded;
+
 use super::{Doubt, SPEED_M_S, doubt};
-use crate::recorded::Recorded;
 
 /// Drives that are measured less often than this are doubted, Hz: the model steps at 10 Hz, and stamps tremble.
 const RATE_MIN_HZ: f64 = 9.0;

@@ -107,7 +107,6 @@ pub fn predictor_of(vehicle: Vehicle, scales: &Normalization, weights: Weights) 
         hash: String::new(),
         form: Variant::Full,
         vehicle,
-        default_soil: scales.default_soil(),
         parameters: 0,
         normalization: scales.clone(),
         weights,

@@ -29,6 +29,7 @@ pub mod written;
 
 pub use act::{Act, Parameter, Quantity, Scaling};
 pub use actuator::*;
+pub use fit::places_at_fault;
 pub use force::*;
 pub use map::*;
 pub use schedule::{Phases, ScheduledEffect};
