@@ -48,7 +48,7 @@ pub struct Config {
     /// Threads that compute predictions.
     pub workers: WorkersConfig,
     /// What is accepted and held at most.
-    pub limits: LimitsConfig,
+    pub limits: Limits,
     /// Soil map of the fleet.
     pub fleet_soil: FleetSoilConfig,
     /// Recording.
@@ -153,58 +153,6 @@ pub struct RecordingConfig {
     pub queue_bytes_max: u64,
 }
 
-/// What is accepted and held at most; see `nesam_engine::Limits`.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields, default)]
-pub struct LimitsConfig {
-    /// Open sessions.
-    pub sessions_max: usize,
-    /// Open sessions of one vehicle.
-    pub sessions_per_vehicle_max: usize,
-    /// Candidate sequences of one prediction.
-    pub samples_max: usize,
-    /// Steps of one prediction, at most 32.
-    pub horizon_max: usize,
-    /// Samples times steps of one prediction.
-    pub sample_steps_max: usize,
-    /// Samples of one prediction with Jacobians.
-    pub jacobian_samples_max: usize,
-    /// Samples of one prediction with covariance.
-    pub covariance_samples_max: usize,
-    /// Samples of one prediction with the terrain encoded at every pose.
-    pub exact_samples_max: usize,
-    /// What-if soils of one prediction.
-    pub soils_max: usize,
-    /// Uploaded maps.
-    pub maps_max: usize,
-    /// Cells of one map.
-    pub map_cells_max: usize,
-    /// Cells of all maps together.
-    pub map_cells_total_max: usize,
-    /// Predictions that wait.
-    pub waiting_predictions_max: usize,
-    /// Predictions of one vehicle that wait.
-    pub waiting_predictions_per_vehicle_max: usize,
-    /// Other commands that wait.
-    pub waiting_commands_max: usize,
-    /// Measurements of one vehicle among them.
-    pub waiting_measurements_per_vehicle_max: usize,
-    /// |position| along each axis, m.
-    pub position_max_m: f64,
-    /// |velocity| along each axis, m/s.
-    pub speed_max_m_s: f64,
-    /// |angular velocity| about each axis, rad/s.
-    pub angular_speed_max_rad_s: f64,
-    /// Longest pause between two measurements of one session, s.
-    pub pause_max_s: f64,
-    /// How far behind the newest measurement one may arrive and still be put in its place, s.
-    pub reorder_window_s: f64,
-    /// How much further ahead than time has passed a stamp may lie, s.
-    pub clock_ahead_max_s: f64,
-    /// Time after which a session that nobody feeds and nobody asks is closed, s.
-    pub session_idle_s: f64,
-}
-
 impl Default for GrpcConfig {
     fn default() -> Self {
         Self {
@@ -260,67 +208,6 @@ impl From<&FleetSoilConfig> for FleetSoilSettings {
 impl Default for RecordingConfig {
     fn default() -> Self {
         Self { enabled: false, directory: "recordings".into(), part_bytes_max: 1 << 30, bytes_max: 16 << 30, queue_bytes_max: 256 << 20 }
-    }
-}
-
-impl Default for LimitsConfig {
-    fn default() -> Self {
-        let l = Limits::default();
-        Self {
-            sessions_max: l.sessions_max,
-            sessions_per_vehicle_max: l.sessions_per_vehicle_max,
-            samples_max: l.samples_max,
-            horizon_max: l.horizon_max,
-            sample_steps_max: l.sample_steps_max,
-            jacobian_samples_max: l.jacobian_samples_max,
-            covariance_samples_max: l.covariance_samples_max,
-            exact_samples_max: l.exact_samples_max,
-            soils_max: l.soils_max,
-            maps_max: l.maps_max,
-            map_cells_max: l.map_cells_max,
-            map_cells_total_max: l.map_cells_total_max,
-            waiting_predictions_max: l.waiting_predictions_max,
-            waiting_predictions_per_vehicle_max: l.waiting_predictions_per_vehicle_max,
-            waiting_commands_max: l.waiting_commands_max,
-            waiting_measurements_per_vehicle_max: l.waiting_measurements_per_vehicle_max,
-            position_max_m: l.position_max_m,
-            speed_max_m_s: l.speed_max_m_s,
-            angular_speed_max_rad_s: l.angular_speed_max_rad_s,
-            pause_max_s: l.pause_max_s,
-            reorder_window_s: l.reorder_window_s,
-            clock_ahead_max_s: l.clock_ahead_max_s,
-            session_idle_s: l.session_idle_s,
-        }
-    }
-}
-
-impl From<&LimitsConfig> for Limits {
-    fn from(c: &LimitsConfig) -> Self {
-        Self {
-            sessions_max: c.sessions_max,
-            sessions_per_vehicle_max: c.sessions_per_vehicle_max,
-            samples_max: c.samples_max,
-            horizon_max: c.horizon_max,
-            sample_steps_max: c.sample_steps_max,
-            jacobian_samples_max: c.jacobian_samples_max,
-            covariance_samples_max: c.covariance_samples_max,
-            exact_samples_max: c.exact_samples_max,
-            soils_max: c.soils_max,
-            maps_max: c.maps_max,
-            map_cells_max: c.map_cells_max,
-            map_cells_total_max: c.map_cells_total_max,
-            waiting_predictions_max: c.waiting_predictions_max,
-            waiting_predictions_per_vehicle_max: c.waiting_predictions_per_vehicle_max,
-            waiting_commands_max: c.waiting_commands_max,
-            waiting_measurements_per_vehicle_max: c.waiting_measurements_per_vehicle_max,
-            position_max_m: c.position_max_m,
-            speed_max_m_s: c.speed_max_m_s,
-            angular_speed_max_rad_s: c.angular_speed_max_rad_s,
-            pause_max_s: c.pause_max_s,
-            reorder_window_s: c.reorder_window_s,
-            clock_ahead_max_s: c.clock_ahead_max_s,
-            session_idle_s: c.session_idle_s,
-        }
     }
 }
 
@@ -396,7 +283,7 @@ impl Config {
         self.check_ports()?;
         self.tls.check()?;
         self.zenoh.check()?;
-        let query_bytes = predict_bytes_max(&Limits::from(&self.limits));
+        let query_bytes = predict_bytes_max(&self.limits);
         if self.zenoh.message_bytes_max < query_bytes {
             let reason = format!("is {}, but a prediction within `limits` takes {query_bytes}", self.zenoh.message_bytes_max);
             return Err(ServerError::Value { key: "zenoh.message_bytes_max", reason });

@@ -33,8 +33,8 @@ mod zenoh;
 pub use clock::MonotonicClock;
 pub use cluster::{etcd_endpoint, knows_record};
 pub use config::{
-    ClusterConfig, Config, DiagnosisConfig, Distribution, FleetSoilConfig, GrpcConfig, HttpConfig, LimitsConfig, RecordingConfig,
-    Ros2Config, Ros2Vehicle, StoreConfig, TlsConfig, WorkersConfig, ZenohConfig, ZenohMode, is_loopback_endpoint, is_tls_endpoint,
+    ClusterConfig, Config, DiagnosisConfig, Distribution, FleetSoilConfig, GrpcConfig, HttpConfig, RecordingConfig, Ros2Config,
+    Ros2Vehicle, StoreConfig, TlsConfig, WorkersConfig, ZenohConfig, ZenohMode, is_loopback_endpoint, is_tls_endpoint,
 };
 pub use diagnosis::knows_report;
 pub use error::ServerError;

@@ -7,7 +7,7 @@ use std::sync::Arc;
 use std::task::Poll;
 use std::time::Duration;
 
-use nesam_engine::{Clock as _, Engine, EngineHandle, Event, EventSink, Limits, Tap};
+use nesam_engine::{Clock as _, Engine, EngineHandle, Event, EventSink, Tap};
 use nesam_model::Predictor;
 use nesam_proto::v1 as pb;
 use tokio::net::TcpListener;
@@ -195,7 +195,7 @@ fn keeper_of(config: &Config, predictor: &Predictor, run: u64) -> Keeper {
 pub(crate) fn engine_of(config: &Config, predictor: &Arc<Predictor>, sink: EventSink) -> Result<Engine, ServerError> {
     let unusable =
         |error: &dyn std::fmt::Display| ServerError::SoilFilter { bundle: predictor.bundle().name.clone(), reason: error.to_string() };
-    let engine = Engine::new(predictor.clone(), Limits::from(&config.limits)).map_err(|error| unusable(&error))?;
+    let engine = Engine::new(predictor.clone(), config.limits.clone()).map_err(|error| unusable(&error))?;
     let engine = match config.fleet_soil.enabled {
         true => engine.with_fleet_soil((&config.fleet_soil).into()),
         false => Ok(engine),

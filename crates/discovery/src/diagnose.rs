@@ -10,25 +10,25 @@ use nesam_physics::{SOIL_DIM, SoilCorrection};
 use nesam_terrain::WorldMap;
 use nesam_trajectories::Trajectory;
 
-use crate::bend::{self, Bend};
+use crate::candidates::bend::{self, Bend};
 use crate::candidates::{Candidate, beside_rims, catalogue};
 use crate::claims::{Case, Estimate, Finding, Trace};
-use crate::condense::Condensed;
-use crate::controls::{Kind, NullDrives, Setting};
 use crate::drive_line::{self, DriveLine};
 use crate::error::DiscoveryError;
 use crate::ground::{Ground, Soils};
-use crate::held_out::{HeldOut, Learned, Scoring, far_off, score_held_out};
 use crate::judge::{Judge, case_of, own_yardstick};
 use crate::judgement::{Judgement, Verdict, judge, too_few};
-use crate::lack::Lack;
+use crate::observe::condense::Condensed;
+use crate::observe::lack::Lack;
+use crate::observe::still::refuse_still;
 use crate::observe::{Bench, ObservedDrive, available_in_all, observe_all};
-use crate::own_reference;
 use crate::proof::Trial;
-use crate::proven::{HeldDrives, Proven, keep, prove, said_by_others, said_of_ground};
-use crate::pursuit::{Pursued, pursue};
+use crate::proof::controls::{Kind, NullDrives, Setting};
+use crate::proof::held_out::{HeldOut, Learned, Scoring, far_off, score_held_out};
+use crate::proof::proven::{HeldDrives, Proven, keep, prove, said_by_others, said_of_ground};
+use crate::reference::own_reference;
+use crate::select::pursuit::{Pursued, pursue};
 use crate::select::{EFFECTS_MAX, EFFECTS_ON_TRIAL_MAX, Selection, Yardstick};
-use crate::still::refuse_still;
 use crate::work::Work;
 
 /// What drives are held against.

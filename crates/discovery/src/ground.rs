@@ -9,10 +9,10 @@ use nesam_physics::effects::ScheduledEffect;
 use nesam_physics::{SOIL_DIM, SoilCorrection};
 use rayon::prelude::*;
 
-use crate::channels::Row;
 use crate::claims::Case;
-use crate::condense::{Condensed, SOIL_SD, difference, profiled};
-use crate::metric::Metric;
+use crate::observe::channels::Row;
+use crate::observe::condense::{Condensed, SOIL_SD, difference, profiled};
+use crate::observe::metric::Metric;
 use crate::observe::{Bench, ObservedDrive};
 
 /// Steps of Gauss-Newton.

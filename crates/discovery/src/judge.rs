@@ -7,20 +7,20 @@ use nesam_model::ModelBundle;
 use nesam_physics::SoilCorrection;
 
 use crate::candidates::Candidate;
-use crate::channels::{self, CHANNELS, Row};
 use crate::claims::Case;
-use crate::condense::{Condensed, condense, signatures};
+use crate::claims::fit::Prepared;
 use crate::diagnose::OnProgress;
 use crate::error::DiscoveryError;
-use crate::evidence::Nulls;
-use crate::fit::Prepared;
-use crate::lack::Lack;
-use crate::metric::Metric;
+use crate::observe::channels::{self, CHANNELS, Row};
+use crate::observe::condense::{Condensed, condense, signatures};
+use crate::observe::lack::Lack;
+use crate::observe::metric::Metric;
 use crate::observe::{Bench, ObservedDrive, available_in_all};
-use crate::own_reference;
+use crate::reference::drives::ReferenceDrives;
+use crate::reference::own_reference;
 use crate::reference::{NullGroups, Reference};
-use crate::reference_drives::ReferenceDrives;
 use crate::select::Yardstick;
+use crate::select::evidence::Nulls;
 use crate::work::Work;
 
 /// Share of what the drives of a reference tell of an effect in all channels below which it cannot be seen in some of them (chosen): its evidence is a

@@ -1,12 +1,12 @@
 //! What a set of drives says before the proof: effects that are chosen, sized, refused or left.
 
 use crate::candidates::Candidate;
+use crate::claims::fit::Fit;
 use crate::claims::{Case, Finding};
-use crate::fit::Fit;
-use crate::onset::Onset;
 use crate::reference::DRIVES_MIN;
+use crate::select::onset::Onset;
+use crate::select::settled::{Settled, onset_in_place};
 use crate::select::{DECISIVE, FURTHER, Selection, Yardstick, without};
-use crate::settled::{Settled, onset_in_place};
 
 /// Share of the largest evidence that may be left after the claimed effects, when it is beyond chance (chosen): the model's answer to an effect is not
 /// exact, but most of what is different must be explained before anything is claimed.

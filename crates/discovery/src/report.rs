@@ -5,13 +5,13 @@ use nesam_evaluation::{DIMENSION_KEYS, ErrorSummary, ErrorTree, ModelScore, POSE
 use nesam_physics::effects::Layer;
 use serde_json::{Value, json};
 
-use crate::bend::Bend;
 use crate::candidates::Candidate;
-use crate::channels;
+use crate::candidates::bend::Bend;
 use crate::claims::{Estimate, Finding, Trace};
-use crate::controls::Kind;
 use crate::diagnose::{Against, Diagnosis};
-use crate::manoeuvre;
+use crate::observe::channels;
+use crate::proof::controls::Kind;
+use crate::select::manoeuvre;
 
 /// Version of the rule by which a diagnosis stops.
 pub const STOP_RULE: &str = "17: each sensor of a model on trial held by itself against what measurements contradict, in the channels that it changes by more than is negligible; the soil that fits best alone counts where it predicts better; a gyro or a velocity whose error bends with what it measures is a difference, as an actuator that bends is; a steering whose answer is S-shaped beside what is claimed is a difference; a bend refutes by more than 3 % of the largest evidence; an error that rises refutes by more than a tenth of the largest share by which another surely falls; of a model on trial nothing is claimed by fewer than eight drives, and what is claimed is proven by the fitted drives alone; a model on trial that errs to no side and more than twice as far as a vehicle that goes on as it begins is not right; the drive line of a base on trial whose wheel speeds are measured told by these over time, then of a model on trial up to four effects, on ground that is fitted where no map tells it; a step of a fit that leaves more is halved; an actuator that bends as it is commanded beside what is claimed is a difference; what a proof refutes is withheld and the rest judged again; each fitted effect doubted by its own share; up to three effects, each dated beside the others and held against its rivals; of several each force, soil and actuator proven by itself, without a proof 2.5 thresholds; height, roll and pitch count on a map only; segments in which an effect begins do not count, and each has one size; sensors that wander or jump are a difference; a map answers through the ground; pairwise criterion 6; at most 40 % of the largest evidence left, 20 % for geometry; what varies within drives believed as far as they agree; a factor known by its distance from 1";

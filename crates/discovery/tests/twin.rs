@@ -8,8 +8,8 @@ use common::{
     bundle, bundle_with_drives, diagnose_drives, diagnose_from, diagnose_rover, diagnose_rover_beside, diagnose_rover_on, diagnose_twin,
     drive, drive_from, options, plough, rover, rover_logs, world, world_lower_by,
 };
-use nesam_discovery::channels::Row;
-use nesam_discovery::controls::Kind;
+use nesam_discovery::observe::channels::{self, Row};
+use nesam_discovery::proof::controls::Kind;
 use nesam_discovery::report::Report;
 use nesam_discovery::{Against, Bench, Diagnosis, Judge, ObservedDrive, Verdict, observe, observe_all};
 use nesam_learning::initial::initial_weights;
@@ -373,7 +373,7 @@ fn property_drives_that_lack_a_channel_are_judged_in_the_others() {
             // Predictions on level ground may be too far off to prove it.
             assert_ne!(with.verdict, Verdict::None, "{what}: {}", with.reason);
         }
-        let names: Vec<String> = with.left_out.iter().map(|c| nesam_discovery::channels::name(*c)).collect();
+        let names: Vec<String> = with.left_out.iter().map(|c| channels::name(*c)).collect();
         assert!(names.contains(&left_out.into()), "{what}: {names:?}");
         assert!(with.channels.iter().all(|c| !with.left_out.contains(c)));
         assert!(unseen.is_empty() || with.unseen.contains(&unseen), "{what}: {:?}", with.unseen);

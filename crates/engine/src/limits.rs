@@ -2,6 +2,7 @@
 
 use nesam_model::MAX_HORIZON;
 use nesam_physics::{Control, STATE_DIM, Vehicle, VehicleState};
+use serde::{Deserialize, Serialize};
 
 use crate::error::EngineError;
 use crate::measurement::WheelMeasurement;
@@ -28,8 +29,9 @@ const STATE_FIELDS: [&str; STATE_DIM] = [
     "angular_velocity_rad_s.z",
 ];
 
-/// What the engine accepts and holds at most.
-#[derive(Clone, Debug, PartialEq)]
+/// What the engine accepts and holds at most: the section `limits` of a configuration, and of a recording's header.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
 pub struct Limits {
     /// Open sessions.
     pub sessions_max: usize,
@@ -69,8 +71,8 @@ pub struct Limits {
     pub speed_max_m_s: f64,
     /// |angular velocity| about each axis, rad/s.
     pub angular_speed_max_rad_s: f64,
-    /// How far ahead of the last measurement of a session one may be stamped, s, before as much time has passed on the server too. A stamp further ahead is taken for a broken
-    /// clock; after a pause that both clocks have seen the history starts again, however long it was.
+    /// How far ahead of the last measurement of a session one may be stamped, s, before as much time has passed on the server too. It decides where it is below
+    /// [`clock_ahead_max_s`](Self::clock_ahead_max_s). After a pause that both clocks have seen the history starts again, however long it was.
     pub pause_max_s: f64,
     /// How far behind the newest measurement one may arrive and still be put in its place, s; at most 1. Later ones are refused. Measurements inside this window
     /// count for predictions at once, but the soil filter sees them only when they have left it: the soil is older by as much. 0 = every measurement

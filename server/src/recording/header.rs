@@ -3,11 +3,12 @@
 use std::collections::BTreeMap;
 use std::path::Path;
 
+use nesam_engine::Limits;
 use nesam_model::{Precision, Predictor};
 
 use super::error::RecordingError;
 use crate::clock::unix_ns;
-use crate::config::{FleetSoilConfig, LimitsConfig};
+use crate::config::FleetSoilConfig;
 
 /// Name of the metadata record that begins every part.
 pub(crate) const HEADER: &str = "nesam.recording";
@@ -28,7 +29,7 @@ pub struct RecordingHeader {
     /// Name of the vehicle card.
     pub vehicle: String,
     /// Limits in force.
-    pub limits: LimitsConfig,
+    pub limits: Limits,
     /// Soil map of the fleet.
     pub fleet_soil: FleetSoilConfig,
     /// Settings of the soil filter that the bundle carries, JSON; empty = the defaults of the program.
@@ -45,7 +46,7 @@ pub struct RecordingHeader {
 
 impl RecordingHeader {
     /// The header of a run that starts now.
-    pub fn of_run(predictor: &Predictor, limits: &LimitsConfig, fleet_soil: &FleetSoilConfig, engine_now_ns: u64) -> Self {
+    pub fn of_run(predictor: &Predictor, limits: &Limits, fleet_soil: &FleetSoilConfig, engine_now_ns: u64) -> Self {
         let bundle = predictor.bundle();
         let now_ns = unix_ns().unsigned_abs();
         Self {
@@ -123,7 +124,7 @@ impl RecordingHeader {
         };
         let wrong = |key: &str| RecordingError::unusable(path, format!("`{key}` in the description of the run is not readable"));
         let limits_text = text("limits")?;
-        let mut limits: LimitsConfig = serde_json::from_str(&limits_text).map_err(|_| wrong("limits"))?;
+        let mut limits: Limits = serde_json::from_str(&limits_text).map_err(|_| wrong("limits"))?;
         // Recordings from before there was a limit for one vehicle had none.
         if !limits_text.contains("\"sessions_per_vehicle_max\"") {
             limits.sessions_per_vehicle_max = limits.sessions_max;
@@ -193,7 +194,7 @@ mod tests {
             bundle: "b".into(),
             bundle_hash: "h".into(),
             vehicle: "v".into(),
-            limits: LimitsConfig::default(),
+            limits: Limits::default(),
             fleet_soil: FleetSoilConfig::default(),
             soil_filter: String::new(),
             precision: Precision::bf16_here().unwrap_or_default(),

@@ -102,7 +102,7 @@ pub fn replay(
             given: bundle.hash.clone(),
         });
     }
-    let limits = Limits::from(&header.limits);
+    let limits = header.limits.clone();
     let run = header.run.clone();
     let unusable = |reason: String| RecordingError::Engine { bundle: bundle.name.clone(), reason };
     let mut engine = Engine::new(predictor, limits.clone()).map_err(|error| unusable(error.to_string()))?;

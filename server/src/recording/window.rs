@@ -3,7 +3,7 @@
 use std::collections::BTreeMap;
 use std::sync::Arc;
 
-use nesam_engine::{Command, Limits, Measurement, Reply};
+use nesam_engine::{Command, Measurement, Reply};
 use nesam_proto::v1 as pb;
 use nesam_terrain::WorldMap;
 use prost::Message as _;
@@ -38,7 +38,7 @@ struct Line {
 /// `RecordingError::Unusable` for a command that cannot be read, `NoSession` for a session that is not in the recording, and the errors of
 /// [`Recording::next_command`].
 pub fn window(recording: &mut Recording, session: &str, from_ns: i64, to_ns: i64) -> Result<RecordedWindow, RecordingError> {
-    let (run, limits) = (recording.header().run.clone(), Limits::from(&recording.header().limits));
+    let (run, limits) = (recording.header().run.clone(), recording.header().limits.clone());
     let within = |measurement: &Measurement| (from_ns..=to_ns).contains(&measurement.stamp_ns);
     let mut maps = HeldMaps::default();
     // Map of each session that was there.

@@ -8,7 +8,7 @@ use std::path::PathBuf;
 use std::sync::{Arc, Mutex};
 
 use clap::Args;
-use nesam_discovery::channels::{self, CHANNELS};
+use nesam_discovery::observe::channels::{self, CHANNELS};
 use nesam_discovery::report::{Report, describe};
 use nesam_discovery::{
     Against, Bench, Diagnosis, Judge, Options, Reference, ReferenceDrives, SEGMENT_STEPS, Scoring, Segmented, catalogue, diagnose,

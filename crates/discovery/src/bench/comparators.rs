@@ -19,17 +19,17 @@ use nesam_trajectories::Trajectory;
 use serde::Serialize;
 
 use super::Hidden;
-use crate::black_box::BlackBox;
 use crate::candidates::{Candidate, column_count};
 use crate::claims::Case;
-use crate::condense::{Condensed, best_soil};
-use crate::fit::Fit;
-use crate::free_form::Leftover;
-use crate::held_out::{Scoring, score_models};
+use crate::claims::fit::Fit;
 use crate::judgement::Judgement;
-use crate::onset::Onset;
-use crate::ridge;
+use crate::observe::condense::{Condensed, best_soil};
+use crate::proof::black_box::BlackBox;
+use crate::proof::free_form::Leftover;
+use crate::proof::held_out::{Scoring, score_models};
+use crate::proof::ridge;
 use crate::select::Yardstick;
+use crate::select::onset::Onset;
 use crate::work::Work;
 
 /// Share of a column's typical size below which STLSQ strikes it out (chosen).

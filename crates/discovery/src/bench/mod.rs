@@ -33,10 +33,10 @@ pub use score::{MethodScores, Outcome, Scores, clopper_pearson, method_scores, s
 
 use self::comparators::Compared;
 use crate::error::DiscoveryError;
-use crate::held_out::Scoring;
 use crate::judge::Judge;
 use crate::judgement::judge;
 use crate::observe::{Bench, observe, observe_all};
+use crate::proof::held_out::Scoring;
 use rand::SeedableRng;
 use rand::seq::index::sample;
 use rand_chacha::ChaCha8Rng;

@@ -4,7 +4,7 @@ use super::rims::Rims;
 use super::sized::{Sized, T_MIN};
 use crate::candidates::Candidate;
 use crate::claims::{Estimate, Finding, Member, STABILITY_PARTS};
-use crate::condense::part_of;
+use crate::observe::condense::part_of;
 use crate::select::RIVALS_MAX;
 
 /// Standard errors over drives below which two effects explain as much.

@@ -1,9 +1,9 @@
 //! Chosen effects against their closest rivals once more, each sized through the physics, because a large delay or drag is no multiple of a small one.
 
 use crate::claims::Case;
-use crate::condense::Condensed;
-use crate::evidence::Group;
-use crate::onset::Onset;
+use crate::observe::condense::Condensed;
+use crate::select::evidence::Group;
+use crate::select::onset::Onset;
 use crate::select::{DECISIVE, RIVALS_MAX, Rival, Selection, Yardstick, without};
 
 /// Criterion within which a rival is sized through the physics before it is judged.
@@ -159,7 +159,7 @@ mod tests {
 
     use super::*;
     use crate::candidates::catalogue;
-    use crate::evidence::Nulls;
+    use crate::select::evidence::Nulls;
 
     /// Goal: a rival that was not dated competes as what begins midway. Method: onsets of four hypotheses.
     #[test]

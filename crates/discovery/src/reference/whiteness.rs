@@ -9,9 +9,9 @@ use std::fmt;
 use nesam_evaluation::report::Short;
 use serde::{Deserialize, Serialize};
 
-use crate::channels::{PATH_AT, Row, SEGMENT_STEPS, TURN_AT, name};
-use crate::metric::usual_range;
 use crate::observe::ObservedDrive;
+use crate::observe::channels::{PATH_AT, Row, SEGMENT_STEPS, TURN_AT, name};
+use crate::observe::metric::usual_range;
 
 /// How many times the largest deviation of drives without an effect a jump is (chosen: impacts on rough ground were within twice).
 const JUMP: f64 = 3.0;

@@ -4,9 +4,9 @@ use std::fmt;
 
 use rayon::prelude::*;
 
-use crate::channels::{CHANNELS, Row, SEGMENT_STEPS};
-use crate::condense::{Condensed, profiled};
-use crate::metric::Metric;
+use crate::observe::channels::{CHANNELS, Row, SEGMENT_STEPS};
+use crate::observe::condense::{Condensed, profiled};
+use crate::observe::metric::Metric;
 
 /// Gain over an effect that was always there, in dispersions, from which an onset is named (chosen; 6.6 would be 1 % for one onset given beforehand).
 const DECISIVE: f64 = 14.0;

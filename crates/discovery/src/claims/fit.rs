@@ -6,9 +6,9 @@ use nesam_physics::SoilCorrection;
 use rayon::prelude::*;
 
 use crate::candidates::{Candidate, Free};
-use crate::channels::Row;
-use crate::condense::{Condensed, Signatures, difference};
-use crate::metric::Metric;
+use crate::observe::channels::Row;
+use crate::observe::condense::{Condensed, Signatures, difference};
+use crate::observe::metric::Metric;
 use crate::observe::{Bench, ObservedDrive};
 use nesam_physics::effects::ScheduledEffect;
 

@@ -4,6 +4,13 @@
 //! an effect or another soil changes the prediction through the physics alone. A segment starts at a measured state and runs a few steps: long
 //! enough for forces to rise above the noise of one sample, short enough to stay near the measured path.
 
+pub mod channels;
+pub mod condense;
+pub(crate) mod consistency;
+pub(crate) mod lack;
+pub(crate) mod metric;
+pub(crate) mod still;
+
 use std::sync::Arc;
 
 use nesam_evaluation::{DriveMaps, history_steps};
@@ -16,11 +23,11 @@ use nesam_terrain::WorldMap;
 use nesam_trajectories::Trajectory;
 use rayon::prelude::*;
 
-use crate::bend::Driven;
 use crate::candidates::Candidate;
-use crate::channels::{BINS, CHANNELS, RIM_AT, Row, SEGMENT_STEPS, STATE_CHANNELS, STEERING_AT, available};
-use crate::consistency::add_consistency;
+use crate::candidates::bend::Driven;
 use crate::error::DiscoveryError;
+use crate::observe::channels::{BINS, CHANNELS, RIM_AT, Row, SEGMENT_STEPS, STATE_CHANNELS, STEERING_AT, available};
+use crate::observe::consistency::add_consistency;
 
 /// First sample of the first segment, so that the actuators are known from the commands before it.
 const FIRST_START: usize = 16;

@@ -2,7 +2,7 @@
 
 use nalgebra::{DMatrix, DVector};
 
-use crate::condense::Condensed;
+use crate::observe::condense::Condensed;
 
 /// Standard deviations of the coefficients that are tried, in the unit of the columns.
 const SPREADS: [f64; 7] = [0.01, 0.03, 0.1, 0.3, 1.0, 3.0, 10.0];

@@ -7,13 +7,13 @@ use nesam_physics::effects::{Layer, ScheduledEffect};
 use nesam_trajectories::Trajectory;
 
 use crate::claims::{Case, Finding};
-use crate::condense::best_soil;
-use crate::consistency::Contradictions;
 use crate::diagnose::Options;
 use crate::drive_line::DriveLine;
 use crate::ground::Ground;
-use crate::held_out::{HeldOut, Learned, score_held_out, score_models, shows};
 use crate::judgement::{Judgement, Verdict, judge, together};
+use crate::observe::condense::best_soil;
+use crate::observe::consistency::Contradictions;
+use crate::proof::held_out::{HeldOut, Learned, score_held_out, score_models, shows};
 use crate::proof::{Counted, Rise, falls, falls_surely, not_proven, rises_surely, several_scored, several_show};
 use crate::select::Yardstick;
 use crate::work::Work;
@@ -348,7 +348,7 @@ pub(crate) fn keep<T: Clone>(judgement: &Judgement, effects: Vec<T>) -> Vec<T> {
 }
 
 /// What each drive is predicted with: learned without it. Detection and choice follow from the other drives alone, the size from one step of the whole fit.
-/// What was compared through the physics on all drives is compared in the same way on the others ([`Settled::stands`](crate::settled::Settled::stands)).
+/// What was compared through the physics on all drives is compared in the same way on the others ([`Settled::stands`](crate::select::settled::Settled::stands)).
 fn leave_each_out(yardstick: &Yardstick, case: &Case<'_>, judgement: &Judgement, told: &DriveLine) -> Vec<Learned> {
     let own = judgement.fit.as_ref().map_or_else(Vec::new, |f| keep(judgement, f.effects()));
     let ground = HeldDrives::ground(case, &own, told);

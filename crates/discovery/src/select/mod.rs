@@ -3,15 +3,22 @@
 //! Hypotheses are compared in pairs, by what each leaves to the other. If j is fitted and k still has evidence, but not the reverse, k is preferred:
 //! Δ(j, k) = z²(j after k) - z²(k after j), which for hypotheses of as many parameters is the difference of a cluster-robust information criterion.
 
+pub(crate) mod dating;
+pub mod evidence;
+pub(crate) mod manoeuvre;
+pub mod onset;
+pub mod pursuit;
+pub mod settled;
+
 use nesam_physics::effects::Layer;
 
-use crate::bend::{self, Bend};
 use crate::candidates::Candidate;
-use crate::channels::{PATH_AT, RIM_AT};
-use crate::condense::{Condensed, bend_column, level_column};
-use crate::evidence::{Fitted, Group, Nulls};
+use crate::candidates::bend::{self, Bend};
+use crate::observe::channels::{PATH_AT, RIM_AT};
+use crate::observe::condense::{Condensed, bend_column, level_column};
+use crate::reference::whiteness::Whiteness;
 use crate::reference::{NullGroups, all_evidence};
-use crate::whiteness::Whiteness;
+use crate::select::evidence::{Fitted, Group, Nulls};
 
 /// Difference of the criterion that decides between two hypotheses.
 pub const DECISIVE: f64 = 6.0;
@@ -429,7 +436,7 @@ fn bend_name(bend: Bend) -> String {
 }
 
 fn level_name(channel: usize) -> String {
-    format!("the {}", crate::channels::level_name(channel))
+    format!("the {}", crate::observe::channels::level_name(channel))
 }
 
 /// All but the `i`-th.

@@ -3,6 +3,11 @@
 //! It holds the scores of drives that training never saw, and the metric measured on them. Their scatter is the yardstick, and random groups of them,
 //! judged by the others, give null groups: the largest evidence of a group of as many drives as a set has is the family-wise threshold.
 
+pub(crate) mod drives;
+pub(crate) mod own_reference;
+pub(crate) mod tail;
+pub(crate) mod whiteness;
+
 use nalgebra::{DMatrix, DVector};
 use nesam_evaluation::quantile_sorted;
 use nesam_model::{effects_from_toml, effects_to_toml};
@@ -13,16 +18,16 @@ use rand_chacha::ChaCha8Rng;
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 
-use crate::bend::{self, Bend};
+use crate::candidates::bend::{self, Bend};
 use crate::candidates::{Candidate, catalogue};
-use crate::channels::{self, CHANNELS};
-use crate::condense::{Condensed, believed_within, bend_column, column_names, condense, level_column};
 use crate::error::DiscoveryError;
-use crate::evidence::{Group, Nulls};
-use crate::metric::Metric;
+use crate::observe::channels::{self, CHANNELS};
+use crate::observe::condense::{Condensed, believed_within, bend_column, column_names, condense, level_column};
+use crate::observe::metric::Metric;
 use crate::observe::{Bench, ObservedDrive, available_in_all};
-use crate::reference_drives::Segmented;
-use crate::whiteness::{Succession, Whiteness, asked};
+use crate::reference::drives::Segmented;
+use crate::reference::whiteness::{Succession, Whiteness, asked};
+use crate::select::evidence::{Group, Nulls};
 
 const SCHEMA: &str = "nesam.reference/7";
 /// Random groups of null drives.

@@ -9,7 +9,7 @@
 
 use serde::Serialize;
 
-use crate::channels::{PATH_AT, RIM_AT, STEERING_AT, TURN_AT, name};
+use crate::observe::channels::{PATH_AT, RIM_AT, STEERING_AT, TURN_AT, name};
 
 /// What a vehicle was commanded and did over a segment, in the mean.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]

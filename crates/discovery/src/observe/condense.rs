@@ -10,10 +10,10 @@ use nesam_evaluation::{median, quantile_sorted};
 use nesam_physics::{SOIL_DIM, SoilCorrection};
 use rayon::prelude::*;
 
-use crate::bend::{self, Bend, Driven};
+use crate::candidates::bend::{self, Bend, Driven};
 use crate::candidates::{Candidate, column_count};
-use crate::channels::{CHANNELS, Row, level_name};
-use crate::metric::Metric;
+use crate::observe::channels::{CHANNELS, Row, level_name};
+use crate::observe::metric::Metric;
 use crate::observe::{Bench, ObservedDrive};
 use nesam_physics::effects::{Effect, ScheduledEffect};
 
@@ -34,7 +34,7 @@ pub struct Signatures {
     pub soil: Vec<Vec<Row>>,
     /// What was commanded and done in each segment.
     pub driven: Vec<Driven>,
-    /// Segments that do not count, because an effect that was chosen last may begin within them ([`straddling`](crate::onset)); empty where none does.
+    /// Segments that do not count, because an effect that was chosen last may begin within them ([`straddling`](crate::select::onset)); empty where none does.
     pub uncounted: Vec<usize>,
 }
 

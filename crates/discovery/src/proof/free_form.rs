@@ -9,9 +9,9 @@ use nesam_physics::effects::{Effect, FREE_FORM_AXES, FREE_FORM_FEATURES, FreeFor
 use rayon::prelude::*;
 
 use crate::claims::Case;
-use crate::condense::{Condensed, Parts, difference};
-use crate::fit::{Fit, parameter_columns};
-use crate::ridge;
+use crate::claims::fit::{Fit, parameter_columns};
+use crate::observe::condense::{Condensed, Parts, difference};
+use crate::proof::ridge;
 
 /// Parameters of the term.
 pub const PARAMETERS: usize = FREE_FORM_AXES * FREE_FORM_FEATURES;

@@ -1,6 +1,8 @@
 //! The catalogue, and what an engineer wrote down beside it, as hypotheses: parameters with priors, a linear form for the first look and the effect itself for
 //! the refit.
 
+pub(crate) mod bend;
+
 use std::sync::{LazyLock, Mutex, PoisonError};
 
 use nesam_physics::effects::{Effect, Layer, Scaling, Written};

@@ -1,5 +1,12 @@
 //! When predictions count as better: by errors of full rollouts, paired by drive, with intervals; and when measurements contradict one another less.
 
+pub(crate) mod black_box;
+pub mod controls;
+pub(crate) mod free_form;
+pub mod held_out;
+pub(crate) mod proven;
+pub(crate) mod ridge;
+
 use std::borrow::Cow;
 
 use nesam_evaluation::{
@@ -10,8 +17,8 @@ use nesam_physics::SoilCorrection;
 use nesam_physics::effects::ScheduledEffect;
 use nesam_trajectories::Trajectory;
 
-use crate::consistency::Contradictions;
-use crate::held_out::{HeldOut, Scoring, score_models, shows};
+use crate::observe::consistency::Contradictions;
+use crate::proof::held_out::{HeldOut, Scoring, score_models, shows};
 use crate::work::Work;
 
 /// Most windows of a trial.
@@ -25,7 +32,7 @@ const RISE_OF_FALL: f64 = 0.1;
 pub type Counted = [bool; POSE_DIM + 1];
 
 /// Errors that count on drives with these maps. Where one has none, height, roll and pitch tell of the ground and not of the vehicle, as in
-/// [`available`](crate::channels::available).
+/// [`available`](crate::observe::channels::available).
 pub fn counted(maps: &DriveMaps) -> Counted {
     let mapped = maps.iter().all(Option::is_some);
     [true, true, mapped, mapped, mapped, true, true]

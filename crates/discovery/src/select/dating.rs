@@ -8,11 +8,11 @@ use std::collections::BTreeMap;
 
 use rayon::prelude::*;
 
-use crate::channels::Row;
 use crate::claims::Case;
-use crate::condense::{Signatures, condense};
-use crate::evidence::Group;
-use crate::onset::{self, Course, DISPERSION_MIN, Dated, Onset, PossibleOnset};
+use crate::observe::channels::Row;
+use crate::observe::condense::{Signatures, condense};
+use crate::select::evidence::Group;
+use crate::select::onset::{self, Course, DISPERSION_MIN, Dated, Onset, PossibleOnset};
 use crate::select::{DECISIVE, Selection, Yardstick, without};
 
 /// Most times that effects are dated and chosen again (chosen).
@@ -237,7 +237,7 @@ pub(crate) fn dispersion(yardstick: &Yardstick, hypothesis: usize) -> f64 {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::channels::CHANNELS;
+    use crate::observe::channels::CHANNELS;
     use crate::select::Rival;
 
     fn selection(chosen: &[usize], rivals: &[&[(usize, f64)]]) -> Selection {

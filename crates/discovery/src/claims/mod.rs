@@ -1,5 +1,8 @@
 //! From a selection to claims: size with interval, stability over sub-samples of drives, and the reasons why a claim is refused.
 
+pub(crate) mod constancy;
+pub mod fit;
+
 use std::collections::BTreeMap;
 
 use nesam_evaluation::report::Short;
@@ -8,17 +11,17 @@ use nesam_physics::effects::ScheduledEffect;
 use rayon::prelude::*;
 
 use crate::candidates::Candidate;
-use crate::channels::{self, Row};
-use crate::condense::{Condensed, condense, part_of};
-use crate::dating::Dating;
-use crate::evidence::Group;
-use crate::fit::{Fit, Prepared, Start, Term, fit};
+use crate::claims::fit::{Fit, Prepared, Start, Term, fit};
 use crate::ground::Ground;
-use crate::metric::Metric;
 use crate::observe::Bench;
-use crate::onset::{Onset, PossibleOnset};
+use crate::observe::channels::{self, Row};
+use crate::observe::condense::{Condensed, condense, part_of};
+use crate::observe::metric::Metric;
+use crate::select::dating::Dating;
+use crate::select::evidence::Group;
+use crate::select::onset::{Onset, PossibleOnset};
+use crate::select::settled::Settled;
 use crate::select::{DECISIVE, RIVALS_MAX, Selection, Yardstick, mismatch_of_size};
-use crate::settled::Settled;
 use crate::work::Work;
 
 /// Largest half of the 95 % interval of a claimed magnitude, as a share of it. The interval contains the disagreement between drives: another effect may

@@ -12,12 +12,12 @@ use nesam_trajectories::Trajectory;
 use safetensors::tensor::TensorView;
 use safetensors::{Dtype, SafeTensors};
 
-use crate::bend::Driven;
+use crate::candidates::bend::Driven;
 use crate::candidates::column_count;
-use crate::channels::{CHANNELS, Row};
-use crate::condense::{Signatures, signatures};
 use crate::error::DiscoveryError;
-use crate::lack::Lack;
+use crate::observe::channels::{CHANNELS, Row};
+use crate::observe::condense::{Signatures, signatures};
+use crate::observe::lack::Lack;
 use crate::observe::{Bench, ObservedDrive, observe_plain};
 use crate::reference::Reference;
 

@@ -6,7 +6,7 @@
 use nalgebra::{DMatrix, DVector};
 use nesam_evaluation::median;
 
-use crate::channels::{CHANNELS, Row};
+use crate::observe::channels::{CHANNELS, Row};
 
 /// Share of the correlations within drives that is not believed: hundreds of segments stand behind them.
 const SHRINKAGE_WITHIN: f64 = 0.05;
@@ -29,7 +29,7 @@ pub struct Metric {
     pub within: DMatrix<f64>,
     /// Covariance of a drive's level.
     pub between: DMatrix<f64>,
-    /// Share of what segments say within a drive that is believed against its level ([`believed_within`](crate::condense::believed_within)); 1 = all of it.
+    /// Share of what segments say within a drive that is believed against its level ([`believed_within`](crate::observe::condense::believed_within)); 1 = all of it.
     pub within_believed: f64,
     whiten: DMatrix<f64>,
     level: DMatrix<f64>,

@@ -12,18 +12,18 @@ use nesam_physics::SoilCorrection;
 use nesam_physics::effects::{Layer, ScheduledEffect};
 use rayon::prelude::*;
 
-use crate::channels::Row;
+use crate::claims::fit::{Fit, Term};
 use crate::claims::{Case, Finding};
-use crate::condense::{Beside, Condensed, condense, signatures_beside};
 use crate::error::DiscoveryError;
-use crate::evidence::Group;
-use crate::fit::{Fit, Term};
 use crate::ground::Ground;
 use crate::judge::own_yardstick;
 use crate::observe::available_in_all;
-use crate::onset::Onset;
-use crate::own_reference;
+use crate::observe::channels::Row;
+use crate::observe::condense::{Beside, Condensed, condense, signatures_beside};
 use crate::proof::Trial;
+use crate::reference::own_reference;
+use crate::select::evidence::Group;
+use crate::select::onset::Onset;
 use crate::select::{EFFECTS_ON_TRIAL_MAX, FURTHER, Known, Yardstick};
 
 /// Most looks: some more than effects, for what is refused or taken back (chosen).
@@ -222,9 +222,9 @@ mod tests {
 
     use super::*;
     use crate::candidates::{Candidate, catalogue};
-    use crate::channels::TURN_AT;
-    use crate::condense::level_column;
-    use crate::evidence::Nulls;
+    use crate::observe::channels::TURN_AT;
+    use crate::observe::condense::level_column;
+    use crate::select::evidence::Nulls;
 
     fn named(id: &str) -> Candidate {
         catalogue(&[]).into_iter().find(|c| c.id() == id).unwrap()

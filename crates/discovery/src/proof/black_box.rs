@@ -10,8 +10,8 @@ use nesam_physics::{STATE_DIM, SoilCorrection};
 use rayon::prelude::*;
 
 use crate::claims::Case;
-use crate::condense::{Condensed, Parts, difference};
-use crate::ridge;
+use crate::observe::condense::{Condensed, Parts, difference};
+use crate::proof::ridge;
 
 /// Principal directions of the hidden layer that the head may change along (chosen: most of what a few drives vary).
 const DIRECTIONS: usize = 6;

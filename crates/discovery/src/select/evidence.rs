@@ -7,8 +7,8 @@
 use nalgebra::{Cholesky, DMatrix, DVector, Dyn};
 
 use crate::candidates::SHARE_SD;
-use crate::condense::Condensed;
-use crate::tail::{equivalent_z, ln_chi_square_tail};
+use crate::observe::condense::Condensed;
+use crate::reference::tail::{equivalent_z, ln_chi_square_tail};
 
 /// Least scatter of the scores of a block of several columns, as a ratio of variances to what the metric says (chosen).
 const BLOCK_FLOOR: f64 = 0.3;

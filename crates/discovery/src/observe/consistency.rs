@@ -6,7 +6,7 @@ use nesam_physics::effects::{Effect, ScheduledEffect};
 use nesam_physics::{CONTRADICTIONS, Vehicle, VehicleState, contradiction};
 use nesam_trajectories::Trajectory;
 
-use crate::channels::{PATH_AT, Row, SEGMENT_STEPS, available};
+use crate::observe::channels::{PATH_AT, Row, SEGMENT_STEPS, available};
 use crate::proof::{RISE_MIN, sure_fall};
 
 /// Adds Δp - ∫ R v dt (heading frame of the first sample, m) and Δη - ∫ E ω dt (rad) over consecutive samples, by the trapezoidal rule.
@@ -88,7 +88,7 @@ mod tests {
     use nesam_trajectories::MeasuredChannels;
 
     use super::*;
-    use crate::channels::TURN_AT;
+    use crate::observe::channels::TURN_AT;
 
     #[test]
     fn analytic_a_gyro_bias_shows_as_its_integral_and_a_velocity_scale_as_its_path() {
@@ -105,7 +105,7 @@ mod tests {
             }
         };
         let states: Vec<_> = (0..9).map(at).collect();
-        let mut row = [0.0; crate::channels::CHANNELS];
+        let mut row = [0.0; crate::observe::channels::CHANNELS];
         add_consistency(&states, dt, &mut row);
         assert!((row[TURN_AT + 2] + 0.01 * 0.8).abs() < 1e-12, "{row:?}");
         let chord = speed / rate * (rate * 0.8f64).sin();

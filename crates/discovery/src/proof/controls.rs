@@ -5,16 +5,16 @@ use nesam_evaluation::EvaluationError;
 use nesam_model::Predictor;
 use nesam_physics::effects::{Effect, ScheduledEffect};
 
-use crate::black_box::{self, BlackBox};
 use crate::candidates::Candidate;
 use crate::claims::Case;
-use crate::condense::Condensed;
-use crate::fit::Fit;
-use crate::free_form::{self, Leftover};
+use crate::claims::fit::Fit;
 use crate::judgement::Judgement;
-use crate::onset::Onset;
-use crate::ridge::explained;
+use crate::observe::condense::Condensed;
+use crate::proof::black_box::{self, BlackBox};
+use crate::proof::free_form::{self, Leftover};
+use crate::proof::ridge::explained;
 use crate::select::Yardstick;
+use crate::select::onset::Onset;
 
 /// Closest rivals of each named effect that are refitted in its place.
 const RIVALS: usize = 3;

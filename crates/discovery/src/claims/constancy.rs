@@ -3,20 +3,20 @@
 //! What the fit leaves is searched for a further onset of the effect's own answer, as when effects are dated. An onset must bring a share of what its effect explains,
 //! because answers are not exact; a change of what is sized already must bring what answers of its layer are doubted by, or be as large as that is in the middle of the
 //! drives (28 % of the size, of forces and soils 69 %), so that forces, which depend on how the vehicle is driven, are not refused for that. What has no edge, such as a bias that grows, leaves sensors that go on from segment to segment
-//! ([`whiteness`](crate::whiteness)).
+//! ([`whiteness`](crate::reference::whiteness)).
 
 use nesam_physics::SoilCorrection;
 use nesam_physics::effects::ScheduledEffect;
 use rayon::prelude::*;
 
-use crate::channels::Row;
 use crate::claims::Case;
-use crate::condense::difference;
-use crate::dating::dispersion;
-use crate::fit::Fit;
-use crate::onset::{Change, Course, change, loose};
+use crate::claims::fit::Fit;
+use crate::observe::channels::Row;
+use crate::observe::condense::difference;
+use crate::reference::whiteness::{Succession, Unrest};
+use crate::select::dating::dispersion;
+use crate::select::onset::{Change, Course, change, loose};
 use crate::select::{Yardstick, mismatch, without};
-use crate::whiteness::{Succession, Unrest};
 
 /// What fitted effects leave of a drive.
 struct Left {

@@ -15,13 +15,13 @@ use rand_chacha::ChaCha8Rng;
 use rayon::prelude::*;
 
 use crate::candidates::Candidate;
-use crate::channels::{CHANNELS, Row};
-use crate::condense::Condensed;
 use crate::error::DiscoveryError;
-use crate::evidence::Nulls;
-use crate::metric::Metric;
+use crate::observe::channels::{CHANNELS, Row};
+use crate::observe::condense::Condensed;
+use crate::observe::metric::Metric;
 use crate::observe::{Bench, ObservedDrive, available_in_all};
 use crate::reference::{DRIVES_MIN, NullGroups, all_evidence};
+use crate::select::evidence::Nulls;
 
 /// Random choices of signs.
 const FLIPS: usize = 1000;
