@@ -394,7 +394,8 @@ fn held_against<'a>(
             let plain_predictor = plain;
             let plain = Bench { vehicle: &plain.bundle().vehicle, ..bench };
             let drives: Vec<&ObservedDrive> = observed.iter().collect();
-            let ground = Ground::fitted(&plain, &own_reference::metric(&plain, &observed)?, &drives, &[]);
+            let assumed = plain_predictor.bundle().default_soil();
+            let sought = Ground::sought(plain, &own_reference::metric(&plain, &observed)?, &drives, &assumed);
             let work = Work::begin("drives predicted on another soil", progress);
             let trial = Trial {
                 predictor: plain_predictor,
@@ -403,8 +404,7 @@ fn held_against<'a>(
                 scoring: &options.scoring,
                 work: &work,
             };
-            let better = trial.ground_is_better((&[], &SoilCorrection::NONE), (&[], &ground.correction()))?;
-            ground_alone = Some(if better { ground } else { Ground::assumed() });
+            ground_alone = Some(trial.first_better(sought)?.unwrap_or_else(Ground::assumed));
         }
         let mut case = case_of(own_reference::metric(&bench, &observed)?, bench, observed, progress);
         case.ground_alone = ground_alone;

@@ -2,11 +2,11 @@
 //!
 //! A data sheet says nothing of the ground, and a model on trial is judged on it: hard ground under a model that assumes loam is wrong in every turn, and what makes up
 //! for that would be named. So one soil, common to all drives, is fitted before anything is sought, and once more beside what was found: what is compared with the best
-//! soil alone stands on the best soil itself.
+//! soil alone stands on the best soil itself. It is sought from what the model assumes and from hard ground: from loam no step of a fit leads to a floor.
 
 use nalgebra::{DMatrix, DVector};
 use nesam_physics::effects::ScheduledEffect;
-use nesam_physics::{SOIL_DIM, SoilCorrection};
+use nesam_physics::{HARD_GROUND, SOIL_DIM, SoilCorrection};
 use rayon::prelude::*;
 
 use crate::claims::Case;
@@ -44,10 +44,21 @@ pub(crate) struct Ground {
     shares: DVector<f64>,
     /// What each drive says of the shares there.
     drives: Vec<Condensed>,
+    /// Squared distance of the drives that is left on it, with that from where it was sought.
+    left: f64,
 }
 
 impl Ground {
-    /// Fits one soil to drives with effects, drawn to the assumed one by its prior, by Gauss-Newton through the physics.
+    /// Soils fitted to drives without an effect, where a model assumes this one: drawn to it, and drawn to hard ground. First the one that explains them better.
+    pub fn sought(bench: Bench<'_>, metric: &Metric, drives: &[&ObservedDrive], assumed: &[f64; SOIL_DIM]) -> [Self; 2] {
+        let none = SoilCorrection::NONE;
+        let hard = SoilCorrection { delta: none.coordinates.between(assumed, &HARD_GROUND), ..none };
+        let mut found = [none, hard].map(|ground| Self::fitted(&Bench { ground, ..bench }, metric, drives, &[]));
+        found.sort_by(|a, b| a.left.total_cmp(&b.left));
+        found
+    }
+
+    /// Fits one soil to drives with effects, drawn to that of the bench by its prior, by Gauss-Newton through the physics.
     pub fn fitted(bench: &Bench<'_>, metric: &Metric, drives: &[&ObservedDrive], effects: &[ScheduledEffect]) -> Self {
         // Corrections are added in the coordinates in which the prior is one.
         let rows_at = |shares: &DVector<f64>| -> Vec<Vec<Row>> {
@@ -65,7 +76,7 @@ impl Ground {
         let shares = DVector::zeros(SOIL_DIM);
         let rows = rows_at(&shares);
         let mut least = distance(&shares, &rows);
-        let mut best = Self { from: bench.ground, drives: said_at(&shares, &rows), shares };
+        let mut best = Self { from: bench.ground, drives: said_at(&shares, &rows), shares, left: least };
         for _ in 0..ITERATIONS {
             let mut to = best.without(None);
             let next = (0..=HALVINGS).find_map(|_| {
@@ -75,7 +86,7 @@ impl Ground {
                 (left < least).then_some((left, shares, rows))
             });
             let Some((left, shares, rows)) = next else { break };
-            best = Self { drives: said_at(&shares, &rows), shares, ..best };
+            best = Self { drives: said_at(&shares, &rows), shares, left, ..best };
             let gain = least - left;
             least = left;
             if gain < NOTHING {
@@ -98,7 +109,7 @@ impl Ground {
 
     /// The assumed soil, where predictions are no better on a fitted one.
     pub fn assumed() -> Self {
-        Self { from: SoilCorrection::NONE, shares: DVector::zeros(SOIL_DIM), drives: Vec::new() }
+        Self { from: SoilCorrection::NONE, shares: DVector::zeros(SOIL_DIM), drives: Vec::new(), left: f64::INFINITY }
     }
 
     fn moved(&self, shares: &DVector<f64>) -> SoilCorrection {

@@ -2,7 +2,7 @@
 
 use nesam_model::Normalization;
 use nesam_physics::terramechanics::ContactLaw;
-use nesam_physics::{SecondCommand, TORQUE_KNOTS, TorqueDrive, Vehicle};
+use nesam_physics::{HARD_GROUND, SecondCommand, TORQUE_KNOTS, TorqueDrive, Vehicle};
 
 use crate::at_end::{self, AtEnd};
 use crate::drives::Drive;
@@ -102,6 +102,36 @@ impl DriveLaw {
     }
 }
 
+/// What vehicles of which no map says so are taken to drive on.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum Ground {
+    /// Loam: the soil in the middle of what is known.
+    Middle,
+    /// A floor or a paved road.
+    Hard,
+}
+
+impl Ground {
+    const ALL: [Self; 2] = [Self::Middle, Self::Hard];
+
+    /// As whoever watches a calibration reads it.
+    fn as_str(self) -> &'static str {
+        match self {
+            Self::Middle => "",
+            Self::Hard => ", on hard ground",
+        }
+    }
+
+    /// Scales with that soil.
+    fn under(self, scales: &Normalization) -> Normalization {
+        let mut scales = scales.clone();
+        if self == Self::Hard {
+            scales.set_default_soil(&HARD_GROUND);
+        }
+        scales
+    }
+}
+
 fn name_of(law: ContactLaw) -> &'static str {
     match law {
         ContactLaw::WongReece => "Wong and Reece",
@@ -110,7 +140,7 @@ fn name_of(law: ContactLaw) -> &'static str {
 }
 
 /// The vehicle with its drive line fitted on drives under each contact law and drive, the best pair kept, its suspension fitted with that where drives have a
-/// map, and the scales of the drives; `None` where it was interrupted, which is asked before each number. A number that ends at an end of its range is a line of
+/// map, and the scales of the drives. Where none has a map, loam and hard ground are tried too, and the better one is the default soil of the scales. `None` where it was interrupted, which is asked before each number. A number that ends at an end of its range is a line of
 /// warning.
 pub fn calibrate_vehicle(
     vehicle: Vehicle,
@@ -123,15 +153,19 @@ pub fn calibrate_vehicle(
     let seconds = HORIZON as f64 * dt_s;
     let samples: usize = training.iter().map(|d| d.states.len()).sum();
     let few: Vec<&Drive> = training.iter().copied().step_by((samples / 15_000).max(1)).collect();
-    let mut best: Option<(f64, Vehicle)> = None;
+    let mut best: Option<(f64, Vehicle, Normalization)> = None;
     let skid = vehicle.second == SecondCommand::YawRateRadS;
     let drives_by: &[DriveLaw] = if skid { &DriveLaw::ALL[..1] } else { &DriveLaw::ALL };
     // Under the other law soil has no damping to ask for.
     let laws = ContactLaw::ALL.into_iter().filter(|law| vehicle.soil_damping_pa_s_m == 0.0 || *law == ContactLaw::SoilContactModel);
-    for (law, drive) in laws.flat_map(|law| drives_by.iter().map(move |drive| (law, *drive))) {
+    let mapless = training.iter().all(|drive| drive.map.is_none());
+    let grounds: &[Ground] = if mapless { &Ground::ALL } else { &Ground::ALL[..1] };
+    let ways = laws.flat_map(|law| drives_by.iter().flat_map(move |drive| grounds.iter().map(move |ground| (law, *drive, *ground))));
+    for (law, drive, ground) in ways {
         let Some(start) = drive.of(&vehicle, &few) else { continue };
         let mut candidate = Vehicle { contact_law: law, ..start };
-        let name = format!("{}, {}", name_of(law), drive.as_str());
+        let scales = ground.under(&scales);
+        let name = format!("{}, {}{}", name_of(law), drive.as_str(), ground.as_str());
         reporter.stage(&format!("drive line, {name}"), 3 * if skid { rims::KNOBS_OF_MOTION.len() } else { knobs(&candidate).len() });
         let mut done = 0;
         let progress = |name: &str, value: f64, error: f64| {
@@ -143,13 +177,13 @@ pub fn calibrate_vehicle(
             return None;
         }
         reporter.line(&format!("{name}, pose of the symbolic model alone {before:.3} m -> {after:.3} m over {seconds:.1} s"));
-        if best.as_ref().is_none_or(|(error, _)| after < *error) {
-            best = Some((after, candidate));
+        if best.as_ref().is_none_or(|(error, ..)| after < *error) {
+            best = Some((after, candidate, scales));
         }
     }
-    let mut chosen = best.map_or_else(|| vehicle.clone(), |(_, chosen)| chosen);
+    let (mut chosen, scales) = best.map_or_else(|| (vehicle.clone(), scales), |(_, chosen, scales)| (chosen, scales));
     let warn = |fitted: &Vehicle| at_end::at_ends(&vehicle, fitted).iter().for_each(|end| reporter.line(&format!("warning: {end}")));
-    if training.iter().all(|drive| drive.map.is_none()) {
+    if mapless {
         warn(&chosen);
         return Some((chosen, scales));
     }

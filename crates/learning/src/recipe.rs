@@ -206,7 +206,14 @@ impl Stages<'_> {
                 .ok_or(TrainingError::Unprepared("the vehicle's card was calibrated"))
         };
         match &self.recipe.start {
-            Some(bundle) if self.recipe.recalibrate => Ok((fitted()?.0, bundle.normalization.clone())),
+            Some(bundle) if self.recipe.recalibrate => {
+                let (vehicle, scales) = fitted()?;
+                let mut kept = bundle.normalization.clone();
+                if training.iter().all(|drive| drive.map.is_none()) {
+                    kept.set_default_soil(&scales.default_soil());
+                }
+                Ok((vehicle, kept))
+            }
             Some(bundle) => Ok((damped(&bundle.vehicle), bundle.normalization.clone())),
             None => fitted(),
         }

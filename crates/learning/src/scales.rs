@@ -11,7 +11,7 @@ use nesam_terrain::PatchScale;
 use crate::drives::Drive;
 
 /// A soil in the middle of what vehicles meet, used where nothing is known: between firm dirt and loose sand of Wong's tables.
-const MIDDLE_SOIL: [f64; 6] = [1.3e6, 8.0e3, 0.8, 3.0e3, 0.42, 0.015];
+pub const MIDDLE_SOIL: [f64; 6] = [1.3e6, 8.0e3, 0.8, 3.0e3, 0.42, 0.015];
 
 /// Errors that count as one in the loss: x, y, z (m), attitude (rad), velocity (m/s), angular velocity (rad/s), near the targets of the evaluation.
 const LOSS_SCALE: [f32; STATE_DIM] = [0.15, 0.15, 0.04, 0.012, 0.012, 0.02, 0.15, 0.15, 0.15, 0.15, 0.15, 0.05];

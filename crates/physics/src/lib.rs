@@ -26,7 +26,7 @@ pub use contacts::{ROLLING, Rolling, SUNK, Sunk, Wheels};
 pub use contradiction::{CONTRADICTIONS, contradiction};
 pub use ride::{Ride, UsualRide};
 pub use scalar::Real;
-pub use soil::{SOIL_BOUNDS, SOIL_DIM, SOIL_NAMES, SOIL_UNITS, Soil};
+pub use soil::{HARD_GROUND, SOIL_BOUNDS, SOIL_DIM, SOIL_NAMES, SOIL_UNITS, Soil};
 pub use soil_correction::{SOIL_LOGARITHMIC, SoilCoordinates, SoilCorrection};
 pub use state::{Control, DT_S, STATE_DIM, VehicleState, wrap_angle};
 pub use vehicle::{Driveline, RimServo, SecondCommand, SteeringTable, TORQUE_KNOTS, TorqueDrive, Vehicle, WHEELS};

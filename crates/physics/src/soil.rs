@@ -40,3 +40,7 @@ impl<T: Copy> Soil<T> {
 
 /// Admissible bounds θ_min, θ_max (paper Alg. 1), wide enough for the published soils of Wong's tables from snow to LETE sand.
 pub const SOIL_BOUNDS: [(f64, f64); SOIL_DIM] = [(3.0e4, 1.5e7), (10.0, 2.0e5), (0.1, 1.6), (50.0, 7.0e4), (0.09, 0.75), (0.002, 0.08)];
+
+/// Ground like a floor or a paved road, in the order of [`SOIL_NAMES`]: what a rigid wheel must stand on to hold as a tyre does there (chosen within [`SOIL_BOUNDS`]). The
+/// patch that a tyre has from flexing it has here from sinking by some millimetres; it slides at 0.7 of its load after the least shear.
+pub const HARD_GROUND: [f64; SOIL_DIM] = [2.0e6, 1.0e3, 0.5, 2.0e4, 0.62, 0.002];

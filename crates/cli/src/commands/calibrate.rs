@@ -11,9 +11,10 @@ use nesam_learning::Drive;
 use nesam_learning::at_end::{AtEnd, at_ends};
 use nesam_learning::calibrate::calibrate_vehicle;
 use nesam_learning::recipe::{Reporter, load_drives};
+use nesam_learning::scales::MIDDLE_SOIL;
 use nesam_learning::symbolic::{HORIZON, symbolic_error};
 use nesam_model::{ModelBundle, Normalization};
-use nesam_physics::{SecondCommand, Vehicle};
+use nesam_physics::{SOIL_DIM, SOIL_NAMES, SecondCommand, Vehicle};
 use nesam_trajectories::{Trajectory, card_to_json};
 use serde_json::{Value, json};
 
@@ -44,7 +45,7 @@ which were measured with the old card: make them again with `nesam adapt --calib
 
 What is fitted: how soil and engine act (contact law, rims at an over-speed or hubs under torque), the numbers of the drive line, and over a map the \
 rates and dampings of the suspension; of a skid-steer base the servo of its rims, from measured wheel speeds or, \
-without any, from the motion. Beside its errors are those of a kinematic fit (`kinematic` in the JSON), which knows no soil, no slip and no slopes. \
+without any, from the motion. Where no drive has a map, loam and hard ground are tried too; a bundle keeps the better one (`soil` in the JSON), a card does not. Beside its errors are those of a kinematic fit (`kinematic` in the JSON), which knows no soil, no slip and no slopes. \
 Where the fitted physics turns less or more than the vehicle by a tenth (`turning`), that is a line of warning: a base on casters is none that it can be. \
 A range of commands that the card does not state is widened to the commands of the drives. A number that ends at an end of what is tried is a line of warning (`at_ends` in the JSON): the drives chose the end and not the number.
 
@@ -129,22 +130,29 @@ pub fn run(args: &CalibrateArgs) -> Result<(), Failure> {
         return Err(Failure::input(format!("no drive of set `{}` is of {needed_s:.1} s or more, so nothing can be predicted", drives.set)));
     }
     let widened = drives.root.vehicle_of(&drives.drives);
-    let (vehicle, scales) = calibrated(widened.clone(), &usable, args.data.dt, &Console::default());
+    let fitted = calibrated(widened.clone(), &usable, args.data.dt, &Console::default());
     let scored = if usable.len() > 1 {
-        held_out(card, &usable, &drives.drives, &scales)
+        held_out(card, &usable, &drives.drives, args.data.dt)
     } else {
-        scored(card, &vehicle, [&usable, &usable], &drives.drives, &scales)
+        scored(card, &fitted, [&usable, &usable], &drives.drives)
     };
+    let (vehicle, scales) = fitted;
+    // A card does not hold the ground, a bundle does.
+    let soil = usable.iter().all(|drive| drive.map.is_none()).then(|| scales.default_soil());
     let changes = changes(card, &vehicle);
     let seconds = HORIZON as f64 * args.data.dt;
     summary(&scored, &changes, usable.len() > 1, seconds);
     if card.second == SecondCommand::YawRateRadS && usable.iter().all(|d| d.wheel_speed_rad_s.is_none()) {
         say!("no drive has wheel speeds: the servo of the rims was fitted to the motion, together with what the ground makes of it");
     }
+    let kept = if bundle.is_some() { "the bundle keeps that" } else { "a card does not hold that, a bundle does (--bundle)" };
+    if scales != assumed(&scales) {
+        say!("ground: the drives are predicted best on hard ground, like a floor or a paved road; {kept}");
+    }
     write_file(&path, (card_to_json(&vehicle) + "\n").as_bytes())?;
     say!("wrote {}", path.display());
-    let document = document(args, &drives, &scored, (&changes, &at_ends(&widened, &vehicle)), &path);
-    let saved = bundle.as_ref().map(|base| save_bundle(base, &vehicle, &drives.root.hash(), &out.join("bundle"))).transpose()?;
+    let document = document(args, &drives, &scored, (&changes, &at_ends(&widened, &vehicle)), (soil, &path));
+    let saved = bundle.as_ref().map(|base| save_bundle(base, &vehicle, soil, &drives.root.hash(), &out.join("bundle"))).transpose()?;
     let document = with_bundle(document, saved.as_deref(), provenance(bundle.as_ref(), &drives));
     write_json(&file, &document)?;
     say!("wrote {}", file.display());
@@ -162,8 +170,15 @@ fn calibrated(card: Vehicle, drives: &[&Drive], dt_s: f64, reporter: &dyn Report
     calibrate_vehicle(card, drives, dt_s, reporter, &|| false).expect("nothing interrupts it; this is a bug")
 }
 
+/// Scales with the soil that is assumed where nothing is known.
+fn assumed(scales: &Normalization) -> Normalization {
+    let mut assumed = scales.clone();
+    assumed.set_default_soil(&MIDDLE_SOIL);
+    assumed
+}
+
 /// Errors of every drive with a card that was fitted on others.
-fn held_out(card: &Vehicle, drives: &[&Drive], recorded: &[Trajectory], scales: &Normalization) -> Vec<Scored> {
+fn held_out(card: &Vehicle, drives: &[&Drive], recorded: &[Trajectory], dt_s: f64) -> Vec<Scored> {
     let folds = FOLDS.min(drives.len());
     let progress = Progress::start("drives left out in turn", folds);
     let mut all: Vec<Scored> = Vec::with_capacity(drives.len());
@@ -171,8 +186,8 @@ fn held_out(card: &Vehicle, drives: &[&Drive], recorded: &[Trajectory], scales: 
         let part = |held: bool| -> Vec<&Drive> {
             drives.iter().enumerate().filter(|(i, _)| (i % folds == fold) == held).map(|(_, drive)| *drive).collect()
         };
-        let fitted = calibrated(card.clone(), &part(false), scales.dt_s, &Silent).0;
-        all.extend(scored(card, &fitted, [&part(false), &part(true)], recorded, scales));
+        let fitted = calibrated(card.clone(), &part(false), dt_s, &Silent);
+        all.extend(scored(card, &fitted, [&part(false), &part(true)], recorded));
         progress.set(fold + 1);
     }
     progress.finish();
@@ -180,15 +195,16 @@ fn held_out(card: &Vehicle, drives: &[&Drive], recorded: &[Trajectory], scales: 
     all
 }
 
-/// Errors of drives with two cards, and of the kinematic fit to the drives that the second card was fitted on: (fitted on, scored).
+/// Errors of drives with two cards, the second on the ground that was found with it, and of the kinematic fit to the drives that it was fitted on: (fitted on,
+/// scored).
 fn scored(
     card: &Vehicle,
-    fitted: &Vehicle,
+    (fitted, on_ground): &(Vehicle, Normalization),
     [fitted_on, drives]: [&[&Drive]; 2],
     recorded: &[Trajectory],
-    scales: &Normalization,
 ) -> Vec<Scored> {
-    let errors = |vehicle: &Vehicle, drive: &Drive| {
+    let assumed = assumed(on_ground);
+    let errors = |vehicle: &Vehicle, scales: &Normalization, drive: &Drive| {
         let error = symbolic_error(vehicle, &[drive], scales);
         let tilt_rad = drive.map.is_some().then_some(error.tilt_rad);
         Errors { position_m: error.position_m, yaw_rad: error.yaw_rad, tilt_rad, turning_rad2: error.turning_rad2 }
@@ -198,9 +214,9 @@ fn scored(
     let kinematic = Kinematic::fit(card, &training, HORIZON).ok();
     let one = |drive: &&Drive| Scored {
         trajectory: drive.id.clone(),
-        before: errors(card, drive),
-        after: errors(fitted, drive),
-        kinematic: kinematic.map(|fit| kinematic_error(&fit, card, drive, scales.dt_s)),
+        before: errors(card, &assumed, drive),
+        after: errors(fitted, on_ground, drive),
+        kinematic: kinematic.map(|fit| kinematic_error(&fit, card, drive, on_ground.dt_s)),
     };
     drives.iter().map(one).collect()
 }
@@ -293,7 +309,7 @@ fn document(
     drives: &Drives,
     scored: &[Scored],
     (changes, ends): (&BTreeMap<String, [Value; 2]>, &[AtEnd]),
-    card: &Path,
+    (soil, card): (Option<[f64; SOIL_DIM]>, &Path),
 ) -> Value {
     let errors = |e: Errors| {
         let (yaw_deg, tilt_deg) = (e.yaw_rad.to_degrees(), e.tilt_rad.map(f64::to_degrees));
@@ -318,6 +334,7 @@ fn document(
         "trajectories": trajectories,
         "parameters": parameters,
         "at_ends": at_ends,
+        "soil": soil.map(|soil| SOIL_NAMES.iter().zip(soil).collect::<BTreeMap<_, _>>()),
         "vehicle": card.display().to_string(),
     })
 }
@@ -329,10 +346,19 @@ fn with_bundle(mut document: Value, bundle: Option<&Path>, provenance: nesam_eva
     document
 }
 
-/// Writes a bundle with another card; what was measured with the old one is left out.
-fn save_bundle(base: &ModelBundle, vehicle: &Vehicle, data_hash: &str, to: &Path) -> Result<PathBuf, Failure> {
+/// Writes a bundle with another card, and the ground under it where no map tells; what was measured with the old card is left out.
+fn save_bundle(
+    base: &ModelBundle,
+    vehicle: &Vehicle,
+    soil: Option<[f64; SOIL_DIM]>,
+    data_hash: &str,
+    to: &Path,
+) -> Result<PathBuf, Failure> {
     let mut moved = base.clone();
     moved.move_to(vehicle);
+    if let Some(soil) = soil {
+        moved.normalization.set_default_soil(&soil);
+    }
     let mut bundle = ModelBundle {
         reference_json: None,
         reference_drives: None,

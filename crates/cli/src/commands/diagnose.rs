@@ -330,6 +330,12 @@ fn bundles(report: &Report<'_>) {
     for (bundle, what) in told.into_iter().filter_map(|(bundle, what)| Some((bundle?, what))) {
         say!("bundle with {what}: {bundle}");
     }
+    let another_ground = report.diagnosis.soils.is_some_and(|soils| soils.alone != soils.assumed);
+    if report.bundle.is_none() && another_ground && matches!(report.against, Against::Physics) {
+        say!(
+            "what to do: `nesam calibrate` with --bundle fits the card on the ground that the drives tell of; then diagnose with the bundle that it writes"
+        );
+    }
 }
 
 fn summary(report: &Report<'_>, found: &Diagnosis) {
