@@ -3,7 +3,9 @@
 
 mod common;
 
-use common::{bundle, nesam, said, sample};
+use common::{bundle, nesam, repository, said, sample};
+use nesam_model::ModelBundle;
+use nesam_physics::SOIL_NAMES;
 use serde_json::Value;
 
 /// Goal: the fit is that of training, it is scored on drives that it did not see, and card and bundle can be passed on. Method: the two drives of the train split.
@@ -31,6 +33,7 @@ fn chrono_a_card_is_fitted_as_training_does_and_helps_on_other_drives() {
     let parameters = json["parameters"].as_array().unwrap();
     assert!(parameters.iter().any(|p| p["name"] == "driveline.steering_lag_s" && p["card"] != p["fitted"]), "{json}");
     assert!(json["provenance"]["command"].as_str().unwrap().starts_with("nesam calibrate"));
+    assert!(json["soil"].is_null(), "its map tells of the ground: {json}");
 
     let args = ["--from", bundle.as_str(), "--recalibrate", "--epochs", "0", "--no-mirror", "--out", "trained"];
     let trained = nesam(&[&["train"], &set[..], &args[..]].concat(), here.path());
@@ -60,6 +63,25 @@ fn chrono_a_single_drive_is_scored_on_itself_and_says_so() {
     for (args, words) in [(&second[..], "it steps by 0.1 s"), (&["calibrate", "--set", "nowhere"][..], "no set `nowhere`")] {
         let output = nesam(args, here.path());
         assert!(output.status.code() == Some(2) && said(&output).contains(words), "{}", said(&output));
+    }
+}
+
+/// Goal: a bundle stands on the ground that its card was fitted on. Method: a log without a map; the soil that is told against the one that a bundle assumes.
+#[test]
+fn property_a_bundle_keeps_the_ground_of_its_card() {
+    let here = tempfile::tempdir().unwrap();
+    let (log, card) = (repository().join("docs/example/run.csv"), sample().join("vehicle_hmmwv.json"));
+    let [log, card] = [log, card].map(|path| path.display().to_string());
+    let imported = nesam(&["import", &log, "--to", "mine", "--set", "first", "--vehicle", &card], here.path());
+    assert!(imported.status.success(), "{}", said(&imported));
+    let fitted =
+        nesam(&["calibrate", "--data", "mine", "--set", "first", "--bundle", &bundle("hmmwv-nominal"), "--out", "fit"], here.path());
+    assert!(fitted.status.success() && said(&fitted).contains("on hard ground, pose of the symbolic model"), "{}", said(&fitted));
+    let json: Value = serde_json::from_slice(&std::fs::read(here.path().join("fit/calibrate.json")).unwrap()).unwrap();
+    let kept = ModelBundle::load(&here.path().join("fit/bundle")).unwrap().default_soil();
+    for (name, value) in SOIL_NAMES.iter().zip(kept) {
+        let told = json["soil"][name].as_f64().unwrap();
+        assert!(f64::abs(told / value - 1.0) < 1e-9, "{name}: {told}, the bundle has {value}");
     }
 }
 
