@@ -394,8 +394,6 @@ fn held_against<'a>(
             let plain_predictor = plain;
             let plain = Bench { vehicle: &plain.bundle().vehicle, ..bench };
             let drives: Vec<&ObservedDrive> = observed.iter().collect();
-            let assumed = plain_predictor.bundle().default_soil();
-            let sought = Ground::sought(plain, &own_reference::metric(&plain, &observed)?, &drives, &assumed);
             let work = Work::begin("drives predicted on another soil", progress);
             let trial = Trial {
                 predictor: plain_predictor,
@@ -404,7 +402,8 @@ fn held_against<'a>(
                 scoring: &options.scoring,
                 work: &work,
             };
-            ground_alone = Some(trial.first_better(sought)?.unwrap_or_else(Ground::assumed));
+            let found = Ground::found(plain, &own_reference::metric(&plain, &observed)?, &drives, &trial)?;
+            ground_alone = Some(found.unwrap_or_else(Ground::assumed));
         }
         let mut case = case_of(own_reference::metric(&bench, &observed)?, bench, observed, progress);
         case.ground_alone = ground_alone;

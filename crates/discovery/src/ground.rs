@@ -5,6 +5,7 @@
 //! soil alone stands on the best soil itself. It is sought from what the model assumes and from hard ground: from loam no step of a fit leads to a floor.
 
 use nalgebra::{DMatrix, DVector};
+use nesam_evaluation::EvaluationError;
 use nesam_physics::effects::ScheduledEffect;
 use nesam_physics::{HARD_GROUND, SOIL_DIM, SoilCorrection};
 use rayon::prelude::*;
@@ -14,6 +15,7 @@ use crate::observe::channels::Row;
 use crate::observe::condense::{Condensed, SOIL_SD, difference, profiled};
 use crate::observe::metric::Metric;
 use crate::observe::{Bench, ObservedDrive};
+use crate::proof::Trial;
 
 /// Steps of Gauss-Newton.
 const ITERATIONS: usize = 6;
@@ -49,13 +51,23 @@ pub(crate) struct Ground {
 }
 
 impl Ground {
-    /// Soils fitted to drives without an effect, where a model assumes this one: drawn to it, and drawn to hard ground. First the one that explains them better.
-    pub fn sought(bench: Bench<'_>, metric: &Metric, drives: &[&ObservedDrive], assumed: &[f64; SOIL_DIM]) -> [Self; 2] {
+    /// The soil under drives without a further effect, on which predictions of the fitted drives are better than on the assumed one; `None` where there is none. It is
+    /// drawn to the assumed one or to hard ground: first tried is what explains the drives better.
+    ///
+    /// # Errors
+    /// The first error of the model.
+    pub fn found(bench: Bench<'_>, metric: &Metric, drives: &[&ObservedDrive], trial: &Trial<'_>) -> Result<Option<Self>, EvaluationError> {
         let none = SoilCorrection::NONE;
-        let hard = SoilCorrection { delta: none.coordinates.between(assumed, &HARD_GROUND), ..none };
-        let mut found = [none, hard].map(|ground| Self::fitted(&Bench { ground, ..bench }, metric, drives, &[]));
-        found.sort_by(|a, b| a.left.total_cmp(&b.left));
-        found
+        let assumed = trial.predictor.bundle().default_soil();
+        let hard = SoilCorrection { delta: none.coordinates.between(&assumed, &HARD_GROUND), ..none };
+        let mut sought = [none, hard].map(|ground| Self::fitted(&Bench { ground, ..bench }, metric, drives, &[]));
+        sought.sort_by(|a, b| a.left.total_cmp(&b.left));
+        for ground in sought {
+            if trial.ground_is_better((&[], &none), (&[], &ground.correction()))? {
+                return Ok(Some(ground));
+            }
+        }
+        Ok(None)
     }
 
     /// Fits one soil to drives with effects, drawn to that of the bench by its prior, by Gauss-Newton through the physics.
@@ -98,8 +110,7 @@ impl Ground {
 
     /// The same to the drives of a case, from what was found of the ground before.
     pub fn beside(case: &Case<'_>, effects: &[ScheduledEffect]) -> Self {
-        let drives: Vec<&ObservedDrive> = case.prepared.iter().map(|p| &p.drive).collect();
-        Self::fitted(&case.bench, &case.metric, &drives, effects)
+        Self::fitted(&case.bench, &case.metric, &case.drives(), effects)
     }
 
     /// The soil as a correction of the assumed one.

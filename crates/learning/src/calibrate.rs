@@ -2,13 +2,13 @@
 
 use nesam_model::Normalization;
 use nesam_physics::terramechanics::ContactLaw;
-use nesam_physics::{HARD_GROUND, SecondCommand, TORQUE_KNOTS, TorqueDrive, Vehicle};
+use nesam_physics::{HARD_GROUND, RimServo, SecondCommand, TORQUE_KNOTS, TorqueDrive, Vehicle};
 
 use crate::at_end::{self, AtEnd};
 use crate::drives::Drive;
 use crate::recipe::Reporter;
 use crate::rims::{self, fit_rims, fit_rims_to_motion};
-use crate::scales::measure;
+use crate::scales::{MIDDLE_SOIL, measure};
 use crate::suspension::{TURNS, calibrate_suspension};
 use crate::symbolic::{HORIZON, descend, symbolic_error};
 
@@ -102,13 +102,24 @@ impl DriveLaw {
     }
 }
 
-/// What vehicles of which no map says so are taken to drive on.
+/// What vehicles are taken to drive on where no map tells.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-enum Ground {
-    /// Loam: the soil in the middle of what is known.
+pub enum Ground {
+    /// Loam ([`MIDDLE_SOIL`]).
     Middle,
-    /// A floor or a paved road.
+    /// A floor or a paved road ([`HARD_GROUND`]).
     Hard,
+}
+
+/// A card that was fitted to drives.
+#[derive(Clone, Debug)]
+pub struct Calibrated {
+    /// The fitted card.
+    pub vehicle: Vehicle,
+    /// Scales of the drives, with the soil on which the card was fitted where no map tells.
+    pub scales: Normalization,
+    /// The ground of that soil; `None` where a drive has a map.
+    pub ground: Option<Ground>,
 }
 
 impl Ground {
@@ -122,12 +133,14 @@ impl Ground {
         }
     }
 
-    /// Scales with that soil.
-    fn under(self, scales: &Normalization) -> Normalization {
+    /// Scales with its soil where no map tells.
+    pub fn under(self, scales: &Normalization) -> Normalization {
+        let soil = match self {
+            Self::Middle => MIDDLE_SOIL,
+            Self::Hard => HARD_GROUND,
+        };
         let mut scales = scales.clone();
-        if self == Self::Hard {
-            scales.set_default_soil(&HARD_GROUND);
-        }
+        scales.set_default_soil(&soil);
         scales
     }
 }
@@ -139,23 +152,24 @@ fn name_of(law: ContactLaw) -> &'static str {
     }
 }
 
-/// The vehicle with its drive line fitted on drives under each contact law and drive, the best pair kept, its suspension fitted with that where drives have a
-/// map, and the scales of the drives. Where none has a map, loam and hard ground are tried too, and the better one is the default soil of the scales. `None` where it was interrupted, which is asked before each number. A number that ends at an end of its range is a line of
-/// warning.
+/// The vehicle with its drive line fitted on drives under each contact law and drive, and each ground where none has a map, the best kept; its suspension fitted with
+/// that where drives have one. `None` where it was interrupted, which is asked before each number. A number that ends at an end of its range is a line of warning.
 pub fn calibrate_vehicle(
     vehicle: Vehicle,
     training: &[&Drive],
     dt_s: f64,
     reporter: &dyn Reporter,
     interrupted: &dyn Fn() -> bool,
-) -> Option<(Vehicle, Normalization)> {
+) -> Option<Calibrated> {
     let scales = measure(training, &vehicle, dt_s);
     let seconds = HORIZON as f64 * dt_s;
     let samples: usize = training.iter().map(|d| d.states.len()).sum();
     let few: Vec<&Drive> = training.iter().copied().step_by((samples / 15_000).max(1)).collect();
-    let mut best: Option<(f64, Vehicle, Normalization)> = None;
+    let mut best: Option<(f64, Vehicle, Ground)> = None;
     let skid = vehicle.second == SecondCommand::YawRateRadS;
     let drives_by: &[DriveLaw] = if skid { &DriveLaw::ALL[..1] } else { &DriveLaw::ALL };
+    // Wheel speeds tell them whatever the wheels stand on.
+    let servos = if skid { fit_rims(&vehicle, &few, dt_s) } else { Vec::new() };
     // Under the other law soil has no damping to ask for.
     let laws = ContactLaw::ALL.into_iter().filter(|law| vehicle.soil_damping_pa_s_m == 0.0 || *law == ContactLaw::SoilContactModel);
     let mapless = training.iter().all(|drive| drive.map.is_none());
@@ -164,7 +178,6 @@ pub fn calibrate_vehicle(
     for (law, drive, ground) in ways {
         let Some(start) = drive.of(&vehicle, &few) else { continue };
         let mut candidate = Vehicle { contact_law: law, ..start };
-        let scales = ground.under(&scales);
         let name = format!("{}, {}{}", name_of(law), drive.as_str(), ground.as_str());
         reporter.stage(&format!("drive line, {name}"), 3 * if skid { rims::KNOBS_OF_MOTION.len() } else { knobs(&candidate).len() });
         let mut done = 0;
@@ -172,20 +185,20 @@ pub fn calibrate_vehicle(
             done += 1;
             reporter.progress(done, &format!("{name} = {value:.4}, {error:.3} m"));
         };
-        let [before, after] = calibrate_driveline(&mut candidate, &few, &scales, progress, interrupted);
+        let [before, after] = calibrate_driveline(&mut candidate, &few, &ground.under(&scales), &servos, progress, interrupted);
         if interrupted() {
             return None;
         }
         reporter.line(&format!("{name}, pose of the symbolic model alone {before:.3} m -> {after:.3} m over {seconds:.1} s"));
         if best.as_ref().is_none_or(|(error, ..)| after < *error) {
-            best = Some((after, candidate, scales));
+            best = Some((after, candidate, ground));
         }
     }
-    let (mut chosen, scales) = best.map_or_else(|| (vehicle.clone(), scales), |(_, chosen, scales)| (chosen, scales));
+    let (mut chosen, ground) = best.map_or_else(|| (vehicle.clone(), Ground::Middle), |(_, chosen, ground)| (chosen, ground));
     let warn = |fitted: &Vehicle| at_end::at_ends(&vehicle, fitted).iter().for_each(|end| reporter.line(&format!("warning: {end}")));
     if mapless {
         warn(&chosen);
-        return Some((chosen, scales));
+        return Some(Calibrated { vehicle: chosen, scales: ground.under(&scales), ground: Some(ground) });
     }
     reporter.stage("suspension", TURNS);
     let mut done = 0;
@@ -204,7 +217,7 @@ pub fn calibrate_vehicle(
         after.to_degrees()
     ));
     warn(&chosen);
-    Some((chosen, scales))
+    Some(Calibrated { vehicle: chosen, scales, ground: None })
 }
 
 /// Numbers of the drive line of a car that lie at an end of their range.
@@ -218,12 +231,14 @@ pub fn knobs(vehicle: &Vehicle) -> &'static [Knob] {
     if vehicle.driveline.torque.is_some() { &TORQUE } else { &OVERSPEED }
 }
 
-/// Fits the drive line by coordinate search (each number in turn, shrinking steps) and returns the error of the pose before and after, m. Where it is interrupted, which is
-/// asked before each number, the vehicle is as fitted by then.
-pub fn calibrate_driveline(
+/// Fits the drive line by coordinate search (each number in turn, shrinking steps), of a skid-steer base by the best of the servos that wheel speeds tell or from the
+/// motion where there is none, and returns the error of the pose before and after, m. Where it is interrupted, which is asked before each number, the vehicle is as fitted
+/// by then.
+fn calibrate_driveline(
     vehicle: &mut Vehicle,
     drives: &[&Drive],
     scales: &Normalization,
+    servos: &[RimServo],
     mut progress: impl FnMut(&str, f64, f64),
     interrupted: &dyn Fn() -> bool,
 ) -> [f64; 2] {
@@ -235,7 +250,7 @@ pub fn calibrate_driveline(
             vehicle.driveline.rims = servo;
             (error(&vehicle), servo)
         };
-        let fitted = fit_rims(vehicle, drives, scales.dt_s).into_iter().map(with).min_by(|a, b| a.0.total_cmp(&b.0));
+        let fitted = servos.iter().copied().map(with).min_by(|a, b| a.0.total_cmp(&b.0));
         let (after, servo) = fitted.unwrap_or_else(|| {
             let told = |value: f64, error: f64| progress("rims, from the motion", value, error);
             with(fit_rims_to_motion(vehicle, drives, scales, told, interrupted))

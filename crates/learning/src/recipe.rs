@@ -15,7 +15,7 @@ use nesam_terrain::{PatchScale, WorldMap};
 use nesam_trajectories::{DataRoot, Trajectory};
 
 use crate::autoencoder::{Places, PretrainPlan, pretrain};
-use crate::calibrate::calibrate_vehicle;
+use crate::calibrate::{Calibrated, calibrate_vehicle};
 use crate::drives::{Drive, encode_drives};
 use crate::initial::initial_weights;
 use crate::origin::{self, Origin, digest};
@@ -207,15 +207,17 @@ impl Stages<'_> {
         };
         match &self.recipe.start {
             Some(bundle) if self.recipe.recalibrate => {
-                let (vehicle, scales) = fitted()?;
+                let Calibrated { vehicle, scales, ground } = fitted()?;
                 let mut kept = bundle.normalization.clone();
-                if training.iter().all(|drive| drive.map.is_none()) {
-                    kept.set_default_soil(&scales.default_soil());
+                if let Some(ground) = ground {
+                    // What stood in for it may go with the training, which reads the other.
+                    kept.default_soil_raw = scales.default_soil_raw;
+                    kept = ground.under(&kept);
                 }
                 Ok((vehicle, kept))
             }
             Some(bundle) => Ok((damped(&bundle.vehicle), bundle.normalization.clone())),
-            None => fitted(),
+            None => fitted().map(|fitted| (fitted.vehicle, fitted.scales)),
         }
     }
 

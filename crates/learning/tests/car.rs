@@ -7,7 +7,7 @@ use std::io::Write as _;
 
 use common::{drive_on_side, truck};
 use nesam_learning::Drive;
-use nesam_learning::calibrate::calibrate_vehicle;
+use nesam_learning::calibrate::{Calibrated, calibrate_vehicle};
 use nesam_learning::recipe::Reporter;
 use nesam_learning::scales::MIDDLE_SOIL;
 use nesam_learning::symbolic::symbolic_error;
@@ -62,7 +62,7 @@ fn regress_the_heading_is_not_given_for_the_position() {
     let mut sheet = tempfile::NamedTempFile::new().unwrap();
     sheet.write_all(SHEET.as_bytes()).unwrap();
     let card = read_vehicle_card(sheet.path()).unwrap();
-    let (fitted, scales) = calibrate_vehicle(card.clone(), &drives, 0.1, &Silent, &|| false).unwrap();
+    let Calibrated { vehicle: fitted, scales, .. } = calibrate_vehicle(card.clone(), &drives, 0.1, &Silent, &|| false).unwrap();
     let [before, after] = [&card, &fitted].map(|vehicle| symbolic_error(vehicle, &drives, &scales));
     println!("{before:?} -> {after:?}, coupling {}", fitted.driveline.side_coupling_n_m_s);
     assert!(after.position_m < 0.7 * before.position_m, "{before:?} -> {after:?}");
@@ -79,7 +79,7 @@ fn analytic_ground_without_a_map_is_found() {
     let on_loam = (truck(), [-1.0, 1.0].map(|side| drive_on_side(None, 160, side)).to_vec());
     for ((vehicle, drives), [ground, other]) in [(car, [HARD_GROUND, MIDDLE_SOIL]), (on_loam, [MIDDLE_SOIL, HARD_GROUND])] {
         let drives: Vec<&Drive> = drives.iter().collect();
-        let found = calibrate_vehicle(vehicle, &drives, 0.1, &Silent, &|| false).unwrap().1.default_soil();
+        let found = calibrate_vehicle(vehicle, &drives, 0.1, &Silent, &|| false).unwrap().scales.default_soil();
         let apart = |soil: &[f64]| found.iter().zip(soil).map(|(a, b)| f64::abs(a / b - 1.0)).sum::<f64>();
         assert!(apart(&ground) < 0.01 && apart(&other) > 1.0, "{found:?}");
     }

@@ -9,9 +9,8 @@ use clap::Args;
 use nesam_evaluation::Kinematic;
 use nesam_learning::Drive;
 use nesam_learning::at_end::{AtEnd, at_ends};
-use nesam_learning::calibrate::calibrate_vehicle;
+use nesam_learning::calibrate::{Calibrated, Ground, calibrate_vehicle};
 use nesam_learning::recipe::{Reporter, load_drives};
-use nesam_learning::scales::MIDDLE_SOIL;
 use nesam_learning::symbolic::{HORIZON, symbolic_error};
 use nesam_model::{ModelBundle, Normalization};
 use nesam_physics::{SOIL_DIM, SOIL_NAMES, SecondCommand, Vehicle};
@@ -136,17 +135,17 @@ pub fn run(args: &CalibrateArgs) -> Result<(), Failure> {
     } else {
         scored(card, &fitted, [&usable, &usable], &drives.drives)
     };
-    let (vehicle, scales) = fitted;
+    let Calibrated { vehicle, scales, ground } = fitted;
     // A card does not hold the ground, a bundle does.
-    let soil = usable.iter().all(|drive| drive.map.is_none()).then(|| scales.default_soil());
+    let soil = ground.map(|_| scales.default_soil());
     let changes = changes(card, &vehicle);
     let seconds = HORIZON as f64 * args.data.dt;
     summary(&scored, &changes, usable.len() > 1, seconds);
     if card.second == SecondCommand::YawRateRadS && usable.iter().all(|d| d.wheel_speed_rad_s.is_none()) {
         say!("no drive has wheel speeds: the servo of the rims was fitted to the motion, together with what the ground makes of it");
     }
-    let kept = if bundle.is_some() { "the bundle keeps that" } else { "a card does not hold that, a bundle does (--bundle)" };
-    if scales != assumed(&scales) {
+    if ground == Some(Ground::Hard) {
+        let kept = if bundle.is_some() { "the bundle keeps that" } else { "a card does not hold that, a bundle does (--bundle)" };
         say!("ground: the drives are predicted best on hard ground, like a floor or a paved road; {kept}");
     }
     write_file(&path, (card_to_json(&vehicle) + "\n").as_bytes())?;
@@ -166,15 +165,8 @@ fn same_folder(a: &Path, b: &Path) -> bool {
 }
 
 /// Calibrates to the end: Ctrl-C ends this command as a whole.
-fn calibrated(card: Vehicle, drives: &[&Drive], dt_s: f64, reporter: &dyn Reporter) -> (Vehicle, Normalization) {
+fn calibrated(card: Vehicle, drives: &[&Drive], dt_s: f64, reporter: &dyn Reporter) -> Calibrated {
     calibrate_vehicle(card, drives, dt_s, reporter, &|| false).expect("nothing interrupts it; this is a bug")
-}
-
-/// Scales with the soil that is assumed where nothing is known.
-fn assumed(scales: &Normalization) -> Normalization {
-    let mut assumed = scales.clone();
-    assumed.set_default_soil(&MIDDLE_SOIL);
-    assumed
 }
 
 /// Errors of every drive with a card that was fitted on others.
@@ -197,13 +189,8 @@ fn held_out(card: &Vehicle, drives: &[&Drive], recorded: &[Trajectory], dt_s: f6
 
 /// Errors of drives with two cards, the second on the ground that was found with it, and of the kinematic fit to the drives that it was fitted on: (fitted on,
 /// scored).
-fn scored(
-    card: &Vehicle,
-    (fitted, on_ground): &(Vehicle, Normalization),
-    [fitted_on, drives]: [&[&Drive]; 2],
-    recorded: &[Trajectory],
-) -> Vec<Scored> {
-    let assumed = assumed(on_ground);
+fn scored(card: &Vehicle, fitted: &Calibrated, [fitted_on, drives]: [&[&Drive]; 2], recorded: &[Trajectory]) -> Vec<Scored> {
+    let assumed = Ground::Middle.under(&fitted.scales);
     let errors = |vehicle: &Vehicle, scales: &Normalization, drive: &Drive| {
         let error = symbolic_error(vehicle, &[drive], scales);
         let tilt_rad = drive.map.is_some().then_some(error.tilt_rad);
@@ -215,8 +202,8 @@ fn scored(
     let one = |drive: &&Drive| Scored {
         trajectory: drive.id.clone(),
         before: errors(card, &assumed, drive),
-        after: errors(fitted, on_ground, drive),
-        kinematic: kinematic.map(|fit| kinematic_error(&fit, card, drive, on_ground.dt_s)),
+        after: errors(&fitted.vehicle, &fitted.scales, drive),
+        kinematic: kinematic.map(|fit| kinematic_error(&fit, card, drive, fitted.scales.dt_s)),
     };
     drives.iter().map(one).collect()
 }

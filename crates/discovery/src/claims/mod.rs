@@ -13,10 +13,10 @@ use rayon::prelude::*;
 use crate::candidates::Candidate;
 use crate::claims::fit::{Fit, Prepared, Start, Term, fit};
 use crate::ground::Ground;
-use crate::observe::Bench;
 use crate::observe::channels::{self, Row};
 use crate::observe::condense::{Condensed, condense, part_of};
 use crate::observe::metric::Metric;
+use crate::observe::{Bench, ObservedDrive};
 use crate::select::dating::Dating;
 use crate::select::evidence::Group;
 use crate::select::onset::{Onset, PossibleOnset};
@@ -168,6 +168,11 @@ pub struct Case<'a> {
 }
 
 impl Case<'_> {
+    /// All drives.
+    pub(crate) fn drives(&self) -> Vec<&ObservedDrive> {
+        self.prepared.iter().map(|p| &p.drive).collect()
+    }
+
     /// Scores of all drives.
     pub fn condensed(&self) -> impl Iterator<Item = &Condensed> {
         self.prepared.iter().map(|p| &p.condensed)

@@ -17,7 +17,6 @@ use nesam_physics::SoilCorrection;
 use nesam_physics::effects::ScheduledEffect;
 use nesam_trajectories::Trajectory;
 
-use crate::ground::Ground;
 use crate::observe::consistency::Contradictions;
 use crate::proof::held_out::{HeldOut, Scoring, score_models, shows};
 use crate::work::Work;
@@ -209,19 +208,6 @@ impl Trial<'_> {
         after: (&[ScheduledEffect], &SoilCorrection),
     ) -> Result<bool, EvaluationError> {
         Ok(self.scoring.windows(self.drives).is_ok() && self.no_better(before, after, false)?.is_none())
-    }
-
-    /// The first of these grounds on which predictions without a further effect are better than on the assumed one.
-    ///
-    /// # Errors
-    /// The first error of the model.
-    pub(crate) fn first_better(&self, sought: impl IntoIterator<Item = Ground>) -> Result<Option<Ground>, EvaluationError> {
-        for ground in sought {
-            if self.ground_is_better((&[], &SoilCorrection::NONE), (&[], &ground.correction()))? {
-                return Ok(Some(ground));
-            }
-        }
-        Ok(None)
     }
 
     /// Channels in which measurements contradict one another otherwise with the second effects than with the first, if they surely do less; else none.

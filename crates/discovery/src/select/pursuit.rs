@@ -17,9 +17,9 @@ use crate::claims::{Case, Finding};
 use crate::error::DiscoveryError;
 use crate::ground::Ground;
 use crate::judge::own_yardstick;
+use crate::observe::available_in_all;
 use crate::observe::channels::Row;
 use crate::observe::condense::{Beside, Condensed, condense, signatures_beside};
-use crate::observe::{ObservedDrive, available_in_all};
 use crate::proof::Trial;
 use crate::reference::own_reference;
 use crate::select::evidence::Group;
@@ -60,11 +60,9 @@ pub(crate) fn pursue(
             case.bench.ground != SoilCorrection::NONE
         }
         Some(_) => {
-            let drives: Vec<&ObservedDrive> = case.prepared.iter().map(|p| &p.drive).collect();
-            let assumed = trial.predictor.bundle().default_soil();
-            let better = trial.first_better(Ground::sought(case.bench, &case.metric, &drives, &assumed))?;
-            case.bench.ground = better.as_ref().map_or(SoilCorrection::NONE, Ground::correction);
-            better.is_some()
+            let found = Ground::found(case.bench, &case.metric, &case.drives(), trial)?;
+            case.bench.ground = found.as_ref().map_or(SoilCorrection::NONE, Ground::correction);
+            found.is_some()
         }
     };
     if taken {
