@@ -71,6 +71,18 @@ fn service_wrong_conventions_raise_doubts_and_wrong_mappings_are_refused() {
     assert!(!folder.path().join("root/refused").exists(), "what was refused leaves nothing behind");
 }
 
+/// Goal: a log of another point of the vehicle is moved, and said to be. Method: one of a rear axle; points that are none.
+#[test]
+fn service_a_log_of_the_rear_axle_is_moved_to_the_reference_point() {
+    let folder = tempfile::tempdir().unwrap();
+    let (code, said) = import(folder.path(), "rear", &["--reference", "1.65,0,-0.1"]);
+    assert!(code == Some(0) && said.contains("positions and velocities moved to the reference point, 1.65 m ahead"), "{said}");
+    for (point, word) in [("1.65", "expected three lengths"), ("1,2,x", "`x` is no number"), ("1650,0,0", "lies within 20 m")] {
+        let (code, said) = import(folder.path(), "refused", &["--reference", point]);
+        assert!(code == Some(2) && said.contains(word), "{point} should say `{word}`: {said}");
+    }
+}
+
 #[test]
 fn service_time_stamps_in_nanoseconds_are_refused_without_their_unit() {
     let folder = tempfile::tempdir().unwrap();

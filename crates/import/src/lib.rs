@@ -5,7 +5,7 @@
 //! y left, z up, SI units and radians; it parts them at gaps and where a clock is set back, and says what it left out. [`write_set`] writes them as a set. [`doubts`] says of any recorded
 //! drives what does not fit together: units, signs, frames.
 //!
-//! Nothing is smoothed, resampled or guessed here: a number in a set is a number of the log in another unit or frame. Commands alone are averaged, over the
+//! Nothing is smoothed, resampled or guessed here: a number in a set is a number of the log in another unit, frame or point of the vehicle. Commands alone are averaged, over the
 //! time from a row to the next, where they come between rows.
 #![forbid(unsafe_code)]
 
@@ -20,6 +20,7 @@ mod log;
 mod mapping;
 mod part;
 mod pose;
+mod reference;
 mod sense;
 mod table;
 mod write;

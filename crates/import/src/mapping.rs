@@ -166,7 +166,9 @@ fn remedy(text: &str) -> &'static str {
 
 fn no_unit(unit: &str, target: &str, quantity: Quantity) -> String {
     let units: Vec<&str> = quantity.units().iter().map(|(unit, _)| *unit).collect();
-    format!("`{}` is no unit of `{target}`; allowed are {}", unit.trim(), units.join(", "))
+    let is_angle = Quantity::Angle.units().iter().any(|(known, _)| *known == unit.trim());
+    let other = if target == "cmd_steer" && is_angle { "; a road-wheel angle is `cmd_road_wheel_angle`" } else { "" };
+    format!("`{}` is no unit of `{target}`; allowed are {}{other}", unit.trim(), units.join(", "))
 }
 
 fn entry(line: &str) -> Result<Entry, ImportError> {

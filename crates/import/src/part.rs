@@ -10,6 +10,7 @@ use crate::left_out::LeftOut;
 use crate::log::Log;
 use crate::mapping::Mapping;
 use crate::pose::pose;
+use crate::reference::move_to_reference;
 
 /// Shorter drives hold no prediction and are left out, s.
 const DRIVE_MIN_S: f64 = 1.0;
@@ -40,6 +41,8 @@ pub struct Options {
     pub frame: FrameConvention,
     /// The log may lack heights, roll and pitch: the drives then lack them too, and readers take them for zero and as not measured.
     pub flat: bool,
+    /// Where the reference point of the vehicle card lies in the body axes of the log, from the point whose pose it tells, m.
+    pub reference_m: [f64; 3],
     /// Name of the drives where the log has none.
     pub name: String,
 }
@@ -96,6 +99,9 @@ pub fn drives(log: &Log, options: &Options) -> Result<(Vec<Drive>, Notes), Impor
         commands: commands(log, options)?,
         measured: measured(log, options, &mut notes)?,
     };
+    if options.reference_m != [0.0; 3] {
+        move_to_reference(options.frame.body(options.reference_m), &mut channels.pose, &mut channels.measured, &mut notes);
+    }
     let names = options.mapping.texts(log, "trajectory");
     let (mut drives, mut left_out, mut of_drives) = (Vec::new(), LeftOut::default(), Notes::new());
     let all = by_name(log.rows, names.as_deref(), &options.name);

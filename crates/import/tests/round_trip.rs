@@ -44,7 +44,7 @@ fn flat(lines: &[&str]) -> Options {
 }
 
 fn options(lines: &[&str], frame: FrameConvention) -> Options {
-    Options { mapping: Mapping::parse(lines.iter().copied()).expect("a mapping"), frame, flat: false, name: "log".into() }
+    Options { mapping: Mapping::parse(lines.iter().copied()).expect("a mapping"), frame, name: "log".into(), ..Options::default() }
 }
 
 #[test]
@@ -390,4 +390,49 @@ fn regress_a_quaternion_that_is_not_of_unit_length_is_told() {
     assert!(column(&found[0], "yaw").is_some_and(|yaw| (yaw[0] - std::f64::consts::FRAC_PI_2).abs() < 1e-12));
     assert!(notes.iter().any(|n| n.contains("not of unit length in 30 of 30 rows (1.50")), "{notes:?}");
     assert!(read(&table(1.001), &strict).expect("a drive").1.is_empty());
+}
+
+/// Goal: a log of another point of the vehicle gives the drive of the reference point. Method: a recorded drive as it would be measured 1.65 m behind, 0.2 m to the left and
+/// 0.6 m below its reference point, with velocities of Body, in axes of aviation, with velocities of World; without a gyro velocities are left out and positions are not.
+#[test]
+fn chrono_a_log_of_another_point_gives_the_drive_of_the_reference_point() {
+    let recorded = &recorded()[0];
+    let reference_m = [1.65, -0.2, 0.6];
+    let measured: Vec<_> = recorded.states.iter().map(|state| state.at_point(reference_m.map(|m: f64| -m))).collect();
+    let table = |head: &str, row: &dyn Fn(&nesam_physics::VehicleState<f64>) -> Vec<f64>| {
+        let mut table = format!("t,cmd_speed,cmd_steer,{head}\n");
+        for ((t, state), command) in recorded.time_s.iter().zip(&measured).zip(&recorded.controls) {
+            let cells: Vec<String> = row(state).iter().map(f64::to_string).collect();
+            let _ = writeln!(table, "{t},{},{},{}", command.speed_m_s, command.second, cells.join(","));
+        }
+        table
+    };
+    let close = |read: &Trajectory, entries: std::ops::Range<usize>| {
+        for (k, (a, b)) in read.states.iter().zip(&recorded.states).enumerate() {
+            for i in entries.clone() {
+                let (a, b) = (a.to_array()[i], b.to_array()[i]);
+                assert!((a - b).abs() < 1e-9, "state entry {i} of sample {k}: {a} {b}");
+            }
+        }
+    };
+    let at = |frame: FrameConvention, reference_m: [f64; 3]| Options { reference_m, ..options(&[], frame) };
+    let body = table("x,y,z,roll,pitch,yaw,vbx,vby,vbz,wx,wy,wz", &|state| state.to_array().to_vec());
+    close(&imported(&body, &at(FrameConvention::EnuFlu, reference_m))[0], 0..12);
+    let aviation = table("y,x,z,roll,pitch,yaw,vbx,vby,vbz,wx,wy,wz", &|state| {
+        let [x, y, z, roll, pitch, yaw, u, v, w, p, q, r] = state.to_array();
+        vec![x, y, -z, roll, -pitch, std::f64::consts::FRAC_PI_2 - yaw, u, -v, -w, p, -q, -r]
+    });
+    close(&imported(&aviation, &at(FrameConvention::NedFrd, [1.65, 0.2, -0.6]))[0], 0..12);
+    let world = table("x,y,z,roll,pitch,yaw,vx,vy,vz,wx,wy,wz", &|state| {
+        let mut row = state.to_array();
+        let velocity = nesam_physics::vec3::in_world(&state.attitude_rad, state.velocity_m_s);
+        row[6..9].copy_from_slice(&velocity);
+        row.to_vec()
+    });
+    close(&imported(&world, &at(FrameConvention::EnuFlu, reference_m))[0], 0..12);
+    let no_gyro = table("x,y,z,roll,pitch,yaw,vbx,vby,vbz", &|state| state.to_array()[..9].to_vec());
+    let options = at(FrameConvention::EnuFlu, reference_m);
+    close(&imported(&no_gyro, &options)[0], 0..6);
+    let (drives, notes) = read(&no_gyro, &options).expect("a drive");
+    assert!(column(&drives[0], "vbx").is_none() && notes.iter().any(|note| note.contains("has no yaw rate `wz`")), "{notes:?}");
 }

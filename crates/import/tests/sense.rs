@@ -55,7 +55,17 @@ fn chrono_one_mistake_is_told_and_no_other() {
         let held = drive.states[100].position_m;
         drive.states[100..150].iter_mut().for_each(|s| s.position_m = held);
     };
+    let rear_m = root.vehicle().wheel_centre_m[2][0];
+    let of_rear_axle = |drive: &mut Trajectory| drive.states.iter_mut().for_each(|s| *s = s.at_point([rear_m, 0.0, 0.0]));
+    let late = |drive: &mut Trajectory| {
+        let old: Vec<_> = drive.states.iter().map(|s| s.position_m).collect();
+        // Before it began it went on as it begins.
+        let begun = |k: usize| std::array::from_fn(|i| old[0][i] - (8 - k) as f64 * (old[1][i] - old[0][i]));
+        drive.states.iter_mut().enumerate().for_each(|(k, s)| s.position_m = if k < 8 { begun(k) } else { old[k - 8] });
+    };
     for (expected, told) in [
+        ("positions are of the rear axle", told(&of_rear_axle, usize::MAX)),
+        ("positions come 0.8 s after velocities", told(&late, usize::MAX)),
         ("rim speed of FL", wheels(|[fl, fr, rl, rr]| [-fl, fr, rl, rr])),
         ("rim speed of RR", wheels(|[fl, fr, rl, rr]| [fl, fr, rl, 9.55 * rr])),
         ("the left and right wheels turn against the yaw", wheels(|[fl, fr, rl, rr]| [fr, fl, rr, rl])),

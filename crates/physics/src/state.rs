@@ -1,6 +1,7 @@
 //! The state of the vehicle, its command and the increment of one step.
 
 use crate::scalar::Real;
+use crate::vec3::{add, cross, in_world};
 
 /// Dimension of the state vector of the paper (§III-A): position, attitude, linear and angular velocity.
 pub const STATE_DIM: usize = 12;
@@ -52,6 +53,15 @@ impl<T: Real> VehicleState<T> {
     /// At rest at the origin.
     pub fn zero() -> Self {
         Self::from_array([T::lit(0.0); STATE_DIM])
+    }
+
+    /// The state of another point of the same body, which lies at `point_m` in Body: p + R r and v + ω × r.
+    pub fn at_point(&self, point_m: [T; 3]) -> Self {
+        Self {
+            position_m: add(self.position_m, in_world(&self.attitude_rad, point_m)),
+            velocity_m_s: add(self.velocity_m_s, cross(self.angular_velocity_rad_s, point_m)),
+            ..*self
+        }
     }
 
     /// x + Δx in the order of [`VehicleState::to_array`], the horizontal displacement of the increment turned from the heading frame into World. The yaw is

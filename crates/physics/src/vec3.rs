@@ -48,6 +48,14 @@ pub fn attitude_of_quaternion([x, y, z, w]: [f64; 4]) -> Option<[f64; 3]> {
     Some([roll, pitch, yaw])
 }
 
+/// R_WB v_B: a vector of Body in World, by roll, pitch and yaw, rad.
+#[inline(always)]
+pub fn in_world<T: Real>([roll, pitch, yaw]: &Vec3<T>, v_b: Vec3<T>) -> Vec3<T> {
+    let h = Tilt::new(*roll, *pitch).to_heading(v_b);
+    let (sin, cos) = yaw.sin_cos();
+    [cos * h[0] - sin * h[1], sin * h[0] + cos * h[1], h[2]]
+}
+
 /// R_HB = Ry(pitch) Rx(roll): from Body to the heading frame H (World turned by yaw about z). Rows are the axes of H in Body.
 #[derive(Clone, Copy, Debug)]
 pub struct Tilt<T> {

@@ -44,6 +44,10 @@ pub struct ImportArgs {
     /// Axes of the log
     #[arg(long, value_enum, default_value_t = FrameArg::EnuFlu)]
     frame: FrameArg,
+    /// Where the reference point of the vehicle card, its centre of gravity, lies from the point whose pose the log tells, m, in the body axes of the log: `1.4,0,0.2` where
+    /// the log is of the rear axle
+    #[arg(long, value_name = "X,Y,Z", value_parser = point, default_value = "0,0,0", allow_hyphen_values = true)]
+    reference: [f64; 3],
     /// Do without heights, roll and pitch that the log does not have: they are not written, taken for zero, on level ground, and not scored
     #[arg(long)]
     flat: bool,
@@ -66,6 +70,9 @@ pub struct ImportArgs {
     #[arg(long, value_name = "FILE")]
     html: Option<PathBuf>,
 }
+
+/// Furthest point of a vehicle, m.
+const POINT_MAX_M: f64 = 20.0;
 
 /// Plots of the drives, in the folder of their set.
 const PAGE: &str = "import.html";
@@ -188,6 +195,17 @@ fn check_target(args: &ImportArgs, folder: &Path) -> Result<(), Failure> {
     Ok(())
 }
 
+/// Three lengths of a vehicle, m.
+fn point(text: &str) -> Result<[f64; 3], String> {
+    let lengths: Vec<f64> =
+        text.split(',').map(|part| part.trim().parse().map_err(|_| format!("`{part}` is no number"))).collect::<Result<_, _>>()?;
+    let point = <[f64; 3]>::try_from(lengths).map_err(|_| "expected three lengths in metres, X,Y,Z".to_string())?;
+    match point.iter().all(|m| m.abs() <= POINT_MAX_M) {
+        true => Ok(point),
+        false => Err(format!("a point of the vehicle lies within {POINT_MAX_M} m")),
+    }
+}
+
 fn extension(log: &Path) -> String {
     log.extension().map(|e| e.to_string_lossy().to_ascii_lowercase()).unwrap_or_default()
 }
@@ -213,7 +231,8 @@ fn read(args: &ImportArgs, log: &Path, mapping: &Mapping) -> Result<Vec<Drive>, 
         FrameArg::EnuFlu => FrameConvention::EnuFlu,
         FrameArg::NedFrd => FrameConvention::NedFrd,
     };
-    let (found, more) = drives(&table, &Options { mapping: mapping.clone(), frame, flat: args.flat, name }).or_input()?;
+    let options = Options { mapping: mapping.clone(), frame, flat: args.flat, reference_m: args.reference, name };
+    let (found, more) = drives(&table, &options).or_input()?;
     notes.extend(more);
     say!("{}", log.display());
     notes.iter().for_each(|note| say!("  note: {note}"));

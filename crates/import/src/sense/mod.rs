@@ -8,7 +8,9 @@
 mod card;
 mod commands;
 mod heading;
+mod late;
 mod motion;
+mod point;
 mod positions;
 mod quaternion;
 mod recorded;
@@ -79,6 +81,15 @@ pub fn doubts(drives: &[Trajectory], vehicle: &Vehicle) -> Vec<Doubt> {
     found.extend(road_wheels::angles(drives, vehicle));
     if found.is_empty() {
         found.extend(unit);
+    }
+    // Positions that are late move sideways in turns, otherwise than the velocities do.
+    let late = if found.is_empty() { late::late(drives, vehicle) } else { Vec::new() };
+    if late.is_empty() && attitude_holds && !torn {
+        found.extend(motion::sideways(drives));
+    }
+    found.extend(late);
+    if found.is_empty() {
+        found.extend(point::moves_sideways(drives, vehicle));
     }
     found
 }

@@ -29,25 +29,30 @@ pub(super) fn tilt(drives: &[Trajectory]) -> Option<Doubt> {
     })
 }
 
-/// Velocities that are measured against positions; whether they vary with these is asked where the positions hold.
-pub(super) fn velocity(drives: &[Trajectory], positions_hold: bool) -> Vec<Doubt> {
-    let measured = |drive: &Trajectory| drive.measured.velocity_source != VelocitySource::Positions;
+/// Forward velocities that are measured against positions; whether they vary with these is asked where the positions hold.
+pub(super) fn velocity(drives: &[Trajectory], positions_hold: bool) -> Option<Doubt> {
     let forward = Relation::of(drives, SPEED_M_S, |drive, k, world| {
-        measured(drive).then(|| [forward_m_s(drive, k, world), drive.states[k].velocity_m_s[0]])
+        is_measured(drive).then(|| [forward_m_s(drive, k, world), drive.states[k].velocity_m_s[0]])
     });
-    let left = Relation::of(drives, SIDEWAYS_M_S, |drive, k, world| {
-        measured(drive).then(|| [to_body(drive.states[k].attitude_rad, world)[1], drive.states[k].velocity_m_s[1]])
-    });
-    let wrong = forward.judge("forward velocity", "positions", SAME, "x of the body pointing to the rear", SPEEDS).or_else(|| {
+    forward.judge("forward velocity", "positions", SAME, "x of the body pointing to the rear", SPEEDS).or_else(|| {
         let correlation = forward.unrelated().filter(|_| positions_hold)?;
         Some(doubt(format!("forward velocity does not follow positions (correlation {correlation:.2})"), UNRELATED_ADVICE))
+    })
+}
+
+/// Sideways velocities against positions: they are small, and only their sign can be told.
+pub(super) fn sideways(drives: &[Trajectory]) -> Option<Doubt> {
+    let left = Relation::of(drives, SIDEWAYS_M_S, |drive, k, world| {
+        is_measured(drive).then(|| [to_body(drive.states[k].attitude_rad, world)[1], drive.states[k].velocity_m_s[1]])
     });
-    // Sideways motion is small: only its sign can be told.
-    let sideways = left.reversed(SIDEWAYS_M_S).map(|(count, of)| {
-        let what = format!("sideways velocity has the opposite sign of what positions say in {count} of {of} seconds");
-        doubt(what, "y of the body must point to the left; import with `--frame ned-frd` or negate it")
-    });
-    [wrong, sideways].into_iter().flatten().collect()
+    let (count, of) = left.reversed(SIDEWAYS_M_S)?;
+    let what = format!("sideways velocity has the opposite sign of what positions say in {count} of {of} seconds");
+    Some(doubt(what, "y of the body must point to the left; import with `--frame ned-frd` or negate it"))
+}
+
+/// Whether velocities are not those that positions make.
+fn is_measured(drive: &Trajectory) -> bool {
+    drive.measured.velocity_source != VelocitySource::Positions
 }
 
 /// Measured rates against measured attitudes.

@@ -64,6 +64,17 @@ pub(super) fn surely_most(count: usize, of: usize) -> bool {
     of >= STRETCHES_MIN && count as f64 > 0.5 * of as f64 + (of as f64).sqrt()
 }
 
+/// The means of two channels in every stretch. `pair` tells the two of a sample, given the ground velocity in World, m/s, or `None`.
+pub(super) fn means(drives: &[Trajectory], pair: impl Fn(&Trajectory, usize, [f64; 3]) -> Option<[f64; 2]>) -> Vec<[f64; 2]> {
+    let mean = |drive: &Trajectory, stretch: std::ops::Range<usize>| {
+        let half = stretch.len().div_ceil(2);
+        let pairs = stretch.filter_map(|k| pair(drive, k, ground_velocity_m_s(drive, k)));
+        let pairs: Vec<[f64; 2]> = pairs.filter(|pair| pair.iter().all(|value| value.is_finite())).collect();
+        (pairs.len() >= half).then(|| [0, 1].map(|i| pairs.iter().map(|pair| pair[i]).sum::<f64>() / pairs.len() as f64))
+    };
+    drives.iter().flat_map(|drive| stretches(drive).filter_map(|stretch| mean(drive, stretch)).collect::<Vec<_>>()).collect()
+}
+
 /// The means of two channels, expected and found, in every stretch in which one of them says something.
 ///
 /// Means: a pose that freezes and catches up, noise of differences and the shaking of a suspension are not in them. Stretches: no single drive decides.
@@ -71,15 +82,9 @@ pub(super) fn surely_most(count: usize, of: usize) -> bool {
 pub(super) struct Relation(Vec<[f64; 2]>);
 
 impl Relation {
-    /// `pair` tells the two of a sample, given the ground velocity in World, m/s, or `None`; a mean of the stretch must reach `floor`.
+    /// Of [`means`], one of which must reach `floor`.
     pub(super) fn of(drives: &[Trajectory], floor: f64, pair: impl Fn(&Trajectory, usize, [f64; 3]) -> Option<[f64; 2]>) -> Self {
-        let mean = |drive: &Trajectory, stretch: std::ops::Range<usize>| {
-            let half = stretch.len().div_ceil(2);
-            let pairs = stretch.filter_map(|k| pair(drive, k, ground_velocity_m_s(drive, k)));
-            let pairs: Vec<[f64; 2]> = pairs.filter(|pair| pair.iter().all(|value| value.is_finite())).collect();
-            (pairs.len() >= half).then(|| [0, 1].map(|i| pairs.iter().map(|pair| pair[i]).sum::<f64>() / pairs.len() as f64))
-        };
-        let all: Vec<[f64; 2]> = drives.iter().flat_map(|drive| stretches(drive).filter_map(move |stretch| mean(drive, stretch))).collect();
+        let all = means(drives, pair);
         let (both, found_only): (Vec<_>, Vec<_>) =
             all.iter().filter(|[a, b]| a.abs().max(b.abs()) >= floor).partition(|[expected, _]| expected.abs() >= floor);
         let counts = found_only.len() as f64 >= FOUND_ONLY * all.len() as f64;

@@ -6,9 +6,13 @@ use nesam_trajectories::{MeasuredChannels, VelocitySource};
 /// The wheels of the car lie that far to the left, m.
 const LEFT_M: [f64; 4] = [0.9176, -0.9176, 0.91, -0.91];
 
+/// The reference point of the car lies that far ahead of its rear axle, m.
+const AHEAD_M: f64 = 1.5;
+
 /// A car on a wavy plane that drives curves, in the conventions of the data root.
 fn sound() -> Trajectory {
     let (dt_s, wheelbase_m) = (0.1, 3.3);
+    // Of the rear axle.
     let (mut x, mut y, mut yaw) = (0.0_f64, 0.0_f64, 0.3_f64);
     let (mut states, mut controls, mut wheels, mut angles) = (Vec::new(), Vec::new(), Vec::new(), Vec::new());
     for k in 0..400 {
@@ -17,9 +21,9 @@ fn sound() -> Trajectory {
         let slope = 0.15 * (0.3 * x).cos() * yaw.cos();
         let yaw_rate = speed / wheelbase_m * angle.tan();
         states.push(VehicleState {
-            position_m: [x, y, 0.5 * (0.3 * x).sin()],
+            position_m: [x + AHEAD_M * yaw.cos(), y + AHEAD_M * yaw.sin(), 0.5 * (0.3 * x).sin()],
             attitude_rad: [0.02 * (1.3 * t).sin(), -slope.atan(), wrap_angle(yaw)],
-            velocity_m_s: [speed / slope.atan().cos(), 0.0, 0.0],
+            velocity_m_s: [speed / slope.atan().cos(), AHEAD_M * yaw_rate, 0.0],
             angular_velocity_rad_s: [0.026 * (1.3 * t).cos(), 0.0, yaw_rate],
         });
         controls.push(Control { speed_m_s: speed, second: angle });
@@ -52,6 +56,9 @@ fn sound() -> Trajectory {
 fn car() -> Vehicle {
     let mut car = nesam_test_vehicles::truck();
     (car.second, car.wheelbase_m, car.wheel_radius_m) = (SecondCommand::RoadWheelAngleRad, 3.3, 0.4);
+    for (wheel, centre) in car.wheel_centre_m.iter_mut().enumerate() {
+        centre[0] = if wheel < 2 { 3.3 - AHEAD_M } else { -AHEAD_M };
+    }
     car
 }
 
@@ -406,4 +413,72 @@ fn regress_a_mass_below_that_of_its_parts_is_doubted() {
         );
         assert_eq!(found.len(), usize::from(doubted), "{found:?}");
     }
+}
+
+/// Goal: positions of another point than the reference point of the card are told with where it is; what turns about a point between its axles is not. Method: the sound
+/// drive as it is measured at its rear axle, and 2 m ahead; a heading that is 3 degrees wrong; a drive that turns to the left alone; the same as a skid-steer base, which
+/// turns about its rear axle, and 2 m behind.
+#[test]
+fn analytic_positions_of_another_point_are_told() {
+    let at = |ahead_m: f64| states(move |s| *s = s.at_point([ahead_m, 0.0, 0.0]));
+    let rear = told(at(-AHEAD_M));
+    assert!(rear.contains("of the rear axle") && rear.contains(" m larger than it was") && rear.lines().count() == 1, "{rear}");
+    let ahead = told(at(2.0));
+    assert!(ahead.contains(" m ahead of the reference point") && ahead.contains("smaller") && ahead.lines().count() == 1, "{ahead}");
+    // The path is made of steps along the heading at their beginning, which is half a step of turning behind that of the path: 0.1 m at 2 m/s.
+    for (told, before, expected_m) in [(&rear, "X,Y,Z` that is ", 1.5), (&ahead, "of a point ", 2.0)] {
+        let size_m: f64 = told.split(before).nth(1).and_then(|rest| rest.split(' ').next()?.parse().ok()).unwrap();
+        assert!((size_m - expected_m).abs() < 0.15, "{told}");
+    }
+    assert_eq!(told(states(|s| s.attitude_rad[2] = wrap_angle(s.attitude_rad[2] + 0.05))), "");
+    let to_the_left = |drive: &mut Trajectory| {
+        at(-AHEAD_M)(drive);
+        let straight = drive.states.iter().position(|s| s.angular_velocity_rad_s[2] < 0.0).unwrap();
+        drive.states.truncate(straight);
+    };
+    assert_eq!(told(to_the_left), "");
+    let base = Vehicle { second: SecondCommand::YawRateRadS, ..car() };
+    let turning = |ahead_m: f64| {
+        let mut drive = sound();
+        at(ahead_m)(&mut drive);
+        for (control, state) in drive.controls.iter_mut().zip(&drive.states) {
+            control.second = state.angular_velocity_rad_s[2];
+        }
+        doubts(&[drive], &base)
+    };
+    assert_eq!(turning(-AHEAD_M), []);
+    let behind = turning(-AHEAD_M - 2.0);
+    assert!(behind.len() == 1 && behind[0].what.contains(" m behind the reference point"), "{behind:?}");
+}
+
+/// Goal: channels of another clock are told, and what a vehicle takes to answer is not. Method: the sound drive with positions, the heading, both, and commands that come later
+/// or earlier; commands that are followed after 0.6 s.
+#[test]
+fn analytic_channels_of_another_clock_are_told() {
+    /// Values from `by` samples before; the first or last one where there is none.
+    fn shifted<T: Copy>(values: &mut [T], by: isize) {
+        let old = values.to_vec();
+        let last = old.len() - 1;
+        values.iter_mut().enumerate().for_each(|(k, value)| *value = old[k.saturating_add_signed(-by).min(last)]);
+    }
+    let poses = |by: isize, position: bool, attitude: bool| {
+        told(move |drive| {
+            let mut poses: Vec<_> = drive.states.iter().map(|s| (s.position_m, s.attitude_rad)).collect();
+            shifted(&mut poses, by);
+            for (s, (position_m, attitude_rad)) in drive.states.iter_mut().zip(poses) {
+                s.position_m = if position { position_m } else { s.position_m };
+                s.attitude_rad = if attitude { attitude_rad } else { s.attitude_rad };
+            }
+        })
+    };
+    let commands = |by: isize| told(move |drive| shifted(&mut drive.controls, by));
+    for (expected, told) in [
+        // 1.2 s, and the half step by which the path is behind already.
+        ("positions come 1.3 s after velocities", poses(12, true, false)),
+        ("the speed comes 1.2 s before the speed command", commands(12)),
+        ("the speed comes 1.8 s after the speed command", commands(-18)),
+    ] {
+        assert!(told.contains(expected) && told.contains("of two clocks"), "`{expected}` is not in\n{told}");
+    }
+    assert_eq!(commands(-6), "");
 }

@@ -2,7 +2,7 @@
 
 use nesam_engine::EngineError;
 use nesam_physics::driveline::steering_command_of;
-use nesam_physics::vec3::{Tilt, add, attitude_of_quaternion, cross};
+use nesam_physics::vec3::attitude_of_quaternion;
 use nesam_physics::{Control, SecondCommand, Vehicle, VehicleState};
 use nesam_ros2::messages::{Command, CommandType, Odometry};
 
@@ -15,15 +15,13 @@ pub fn state(odometry: &Odometry, reference_m: [f64; 3]) -> Result<VehicleState<
         let reason = format!("is {:?}, a quaternion of length 1 is expected", odometry.orientation);
         EngineError::invalid("pose.pose.orientation", reason)
     })?;
-    let [roll, pitch, yaw] = attitude_rad;
-    let [ahead, left, up] = Tilt::new(roll, pitch).to_heading(reference_m);
-    let (sin, cos) = yaw.sin_cos();
-    Ok(VehicleState {
-        position_m: add(odometry.position_m, [cos * ahead - sin * left, sin * ahead + cos * left, up]),
+    let of_child_frame = VehicleState {
+        position_m: odometry.position_m,
         attitude_rad,
-        velocity_m_s: add(odometry.linear_m_s, cross(odometry.angular_rad_s, reference_m)),
+        velocity_m_s: odometry.linear_m_s,
         angular_velocity_rad_s: odometry.angular_rad_s,
-    })
+    };
+    Ok(of_child_frame.at_point(reference_m))
 }
 
 /// A command as the card has it, and whether it was beyond the card's range, where the vehicle does what it can.

@@ -3,7 +3,7 @@
 use super::SensorTerms;
 use crate::scalar::Real;
 use crate::state::VehicleState;
-use crate::vec3::{Tilt, Vec3, add, cross, dot, scale};
+use crate::vec3::{Tilt, Vec3, add, cross, dot, in_world, scale};
 
 impl SensorTerms {
     /// Whether a measured state is another one than the true state. The clock is not part of a state.
@@ -188,11 +188,4 @@ fn summed_before<const N: usize>(series: &[[f64; N]], k: usize, steps: f64) -> [
         (at, here, left) = (next.unwrap_or(at), *there, left - share);
     }
     sum
-}
-
-/// A vector of Body in World.
-fn in_world<T: Real>(attitude: &[T; 3], a: Vec3<T>) -> Vec3<T> {
-    let h = Tilt::new(attitude[0], attitude[1]).to_heading(a);
-    let (sin, cos) = attitude[2].sin_cos();
-    [cos * h[0] - sin * h[1], sin * h[0] + cos * h[1], h[2]]
 }
