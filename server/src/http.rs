@@ -52,7 +52,7 @@ async fn metrics(State(state): State<HttpState>) -> Response {
     if let Some(recorder) = &state.recorder {
         let counts = recorder.counts();
         for (name, help, value) in [
-            ("commands", "Commands written to the recording.", counts.recorded),
+            ("commands", "Commands in the file of the recording; those of the last half second are not counted yet.", counts.recorded),
             (
                 "dropped_commands",
                 "Commands missing in the recording because the disk could not follow or a limit was reached.",

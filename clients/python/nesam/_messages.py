@@ -29,14 +29,19 @@ def channel_names(channels: Optional[Sequence[str]]) -> Tuple[str, ...]:
     return tuple(name for name in CHANNELS if name in channels)
 
 
+def _of_wheels(values: Optional[t.Vector], count: int, name: str) -> Optional[np.ndarray]:
+    """One number of each wheel, None where they are not measured; ValueError for another count, which a service would refuse, or end the stream for."""
+    return None if values is None else t.array(values, (count,), name)
+
+
 def measurement_message(measurement: t.Measurement) -> measurements_pb2.Measurement:
     """A measurement as message. ValueError for an array of a wrong shape or with masked numbers, and a number that does not fit."""
     command = t.array(measurement.command, (2,), "command")
     wheels = None
     if measurement.wheel_speed_rad_s is not None or measurement.road_wheel_angle_rad is not None:
         wheels = measurements_pb2.WheelMeasurement(
-            speed_rad_s=unmasked(measurement.wheel_speed_rad_s, "wheel_speed_rad_s"),
-            road_wheel_angle_rad=unmasked(measurement.road_wheel_angle_rad, "road_wheel_angle_rad"),
+            speed_rad_s=_of_wheels(measurement.wheel_speed_rad_s, 4, "wheel_speed_rad_s"),
+            road_wheel_angle_rad=_of_wheels(measurement.road_wheel_angle_rad, 2, "road_wheel_angle_rad"),
         )
     return measurements_pb2.Measurement(
         session_id=measurement.session_id,

@@ -57,6 +57,20 @@ def test_property_what_is_masked_elsewhere_is_refused_by_name(name, ask):
         ask(client)
 
 
+@pytest.mark.parametrize("name, count", [("wheel_speed_rad_s", 4), ("road_wheel_angle_rad", 2)])
+def test_regress_numbers_of_wheels_are_as_many_as_wheels(name, count):
+    """A stream would end for 10 000 of them, and a durable one would send them again for ever."""
+    with nesam.Client("127.0.0.1:9", timeout_s=0.2) as client:
+        for wrong in (np.ones(count + 1), np.ones(10_000), np.ones((count, 1))):
+            measurement = nesam.Measurement("s", 0, np.zeros(12), (0.0, 0.0), **{name: wrong})
+            with pytest.raises(ValueError, match=f"^{name} has shape"):
+                client.measure([measurement])
+            stream = client.durable_stream("s")
+            with pytest.raises(ValueError, match=f"^{name} has shape"):
+                stream.send(measurement)
+            assert not stream.pending
+
+
 def test_service_iterators_are_read_once_for_the_service_and_the_fallback(driven, server_address):
     session = driven.session("truck")
     last = session.last_stamp_ns

@@ -184,6 +184,9 @@ async fn service_the_log_tells_who_changes_what_and_no_secret() {
     client.open_session(open()).await.unwrap();
     connect(&other).await.open_session(open()).await.unwrap_err();
     client.close_session("truck").await.unwrap();
+    // A name that would be a line of its own, of somebody else, and longer than any name.
+    let forged = format!("x`\n2026-01-01T00:00:00Z  INFO nesam::audit: allowed: forged {}", "z".repeat(50_000));
+    client.open_session(v1::OpenSessionRequest { session_id: forged, ..open() }).await.unwrap_err();
     let useless = sign(uri("nesam:vehicle:none")).1;
     write(at("server.key"), &useless).unwrap();
 
@@ -207,6 +210,8 @@ async fn service_the_log_tells_who_changes_what_and_no_secret() {
         assert!(line.contains("vehicle `truck`") && line.contains("127.0.0.1"), "{line}");
     }
     assert!(logged("refused: no right").contains("other"));
+    let forged = logged("forged");
+    assert!(forged.contains("allowed: open session `x\\u{60}\\n2026") && forged.len() < 500, "{forged}");
     logged("cannot be used");
     server.kill().unwrap();
     server.wait().unwrap();

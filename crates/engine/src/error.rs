@@ -3,18 +3,19 @@
 use nesam_model::ModelError;
 
 use crate::query::Provenance;
+use crate::shown::Shown;
 
 /// Why a command was refused. No refused command changes anything.
 #[derive(Clone, Debug, PartialEq, thiserror::Error)]
 pub enum EngineError {
     /// No session of this name is open.
-    #[error("session `{session}` is not open; open it first")]
+    #[error("session `{}` is not open; open it first", Shown(session))]
     UnknownSession {
         /// Name asked for.
         session: String,
     },
     /// A session of this name is open already.
-    #[error("session `{session}` is open already; close it first or choose another session id")]
+    #[error("session `{}` is open already; close it first or choose another session id", Shown(session))]
     SessionExists {
         /// Name asked for.
         session: String,
@@ -22,7 +23,7 @@ pub enum EngineError {
         field: &'static str,
     },
     /// No map of this name was uploaded.
-    #[error("map `{map}` is not known; upload it first")]
+    #[error("map `{}` is not known; upload it first", Shown(map))]
     UnknownMap {
         /// Name asked for.
         map: String,

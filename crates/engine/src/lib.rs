@@ -38,6 +38,7 @@ mod queue;
 mod ranking;
 mod service_time;
 mod session;
+mod shown;
 pub mod sync;
 
 pub use candidates::{Candidates, Drawing};
@@ -62,3 +63,4 @@ pub use session::{
     Alarm, AlarmKind, AppliedEffect, AppliedEffects, AppliedParameter, BufferTest, Observed, OpenForecast, Session, SessionImage,
     SoilEstimate, SoilState, TrackImage, UNCERTAIN_MAX, WatchImage,
 };
+pub use shown::Shown;

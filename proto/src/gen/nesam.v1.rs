@@ -1064,7 +1064,8 @@ pub mod measurements_client {
             self.inner = self.inner.max_encoding_message_size(limit);
             self
         }
-        /// Feeds sessions. Each measurement gets exactly one answer, in order; a bad one is answered, not applied, and does not end the stream.
+        /// Feeds sessions. Each measurement gets exactly one answer, in order; a bad one is answered, not applied, and does not end the stream. What is
+        /// no Measurement at all, or is larger than 64 KiB, does: gRPC itself ends it with INTERNAL or OUT_OF_RANGE.
         pub async fn stream(
             &mut self,
             request: impl tonic::IntoStreamingRequest<Message = super::Measurement>,
@@ -1110,7 +1111,8 @@ pub mod measurements_server {
             >
             + std::marker::Send
             + 'static;
-        /// Feeds sessions. Each measurement gets exactly one answer, in order; a bad one is answered, not applied, and does not end the stream.
+        /// Feeds sessions. Each measurement gets exactly one answer, in order; a bad one is answered, not applied, and does not end the stream. What is
+        /// no Measurement at all, or is larger than 64 KiB, does: gRPC itself ends it with INTERNAL or OUT_OF_RANGE.
         async fn stream(
             &self,
             request: tonic::Request<tonic::Streaming<super::Measurement>>,

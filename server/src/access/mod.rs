@@ -15,6 +15,7 @@ mod rereading;
 use std::net::SocketAddr;
 use std::sync::Arc;
 
+use nesam_engine::Shown;
 use tokio::sync::watch;
 use tonic::metadata::MetadataMap;
 use tonic::{Request, Status};
@@ -236,7 +237,7 @@ impl Caller {
         if allowed {
             return Ok(vehicle);
         }
-        tracing::warn!(target: "nesam::audit", %identity, ?wish, "refused: no right");
+        tracing::warn!(target: "nesam::audit", %identity, %wish, "refused: no right");
         self.access.refusals.count(Refusal::Right);
         Err(Status::permission_denied(format!("{identity} has no right to {wish}; the fleet file of the server gives rights")))
     }
@@ -245,12 +246,12 @@ impl Caller {
 impl core::fmt::Display for Wish<'_> {
     fn fmt(&self, f: &mut core::fmt::Formatter<'_>) -> core::fmt::Result {
         match self {
-            Self::ReadSession(session) => write!(f, "read session `{session}`"),
-            Self::ApplyEffects(session) => write!(f, "change the effects of session `{session}`"),
-            Self::Diagnose(session) => write!(f, "diagnose session `{session}`"),
-            Self::ChangeSession(session) => write!(f, "change session `{session}`"),
-            Self::OpenSession { vehicle, session } => write!(f, "open session `{session}` of vehicle `{vehicle}`"),
-            Self::ChangeMap(map) => write!(f, "change map `{map}`"),
+            Self::ReadSession(session) => write!(f, "read session `{}`", Shown(session)),
+            Self::ApplyEffects(session) => write!(f, "change the effects of session `{}`", Shown(session)),
+            Self::Diagnose(session) => write!(f, "diagnose session `{}`", Shown(session)),
+            Self::ChangeSession(session) => write!(f, "change session `{}`", Shown(session)),
+            Self::OpenSession { vehicle, session } => write!(f, "open session `{}` of vehicle `{}`", Shown(session), Shown(vehicle)),
+            Self::ChangeMap(map) => write!(f, "change map `{}`", Shown(map)),
         }
     }
 }

@@ -9,6 +9,9 @@ use tonic_types::{ErrorDetails, StatusExt as _};
 /// Trailing metadata that carries the path of the field at fault.
 pub const FIELD_METADATA: &str = "nesam-field";
 
+/// Characters of a message.
+const MESSAGE_CHARACTERS_MAX: usize = 1000;
+
 /// Code of a refusal.
 pub fn code(error: &EngineError) -> Code {
     match error {
@@ -31,19 +34,28 @@ pub fn to_status(error: EngineError) -> Status {
     if matches!(error, EngineError::Internal { .. }) {
         tracing::error!(%error, "internal error");
     }
+    let message = short(error.to_string());
     let status = match &error {
         EngineError::Overloaded { retry_after_ns, .. } => {
             let details = ErrorDetails::with_retry_info(Some(Duration::from_nanos(*retry_after_ns)));
-            Status::with_error_details(code(&error), error.to_string(), details)
+            Status::with_error_details(code(&error), message, details)
         }
-        _ => Status::new(code(&error), error.to_string()),
+        _ => Status::new(code(&error), message),
     };
     at_field(status, error.field())
 }
 
+/// A message that fits into the trailers that every client takes (8 KiB with all else in them, each letter up to six bytes of them).
+fn short(message: String) -> String {
+    match message.char_indices().nth(MESSAGE_CHARACTERS_MAX) {
+        Some((end, _)) => format!("{}…", &message[..end]),
+        None => message,
+    }
+}
+
 /// A refusal that names the field at fault, in its message and in the metadata.
 pub(crate) fn refused(code: Code, field: &str, reason: impl core::fmt::Display) -> Status {
-    at_field(Status::new(code, format!("`{field}`: {reason}")), field)
+    at_field(Status::new(code, short(format!("`{field}`: {reason}"))), field)
 }
 
 fn at_field(mut status: Status, field: &str) -> Status {

@@ -50,7 +50,7 @@ struct Shared {
 /// Counters of a recording.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub struct RecorderCounts {
-    /// Commands written.
+    /// Commands in the file; those of the last half second are not counted yet.
     pub recorded: u64,
     /// Commands that the disk could not follow or that came after the end.
     pub dropped: u64,
@@ -90,6 +90,7 @@ impl Recorder {
             maps: HeldMaps::default(),
             soil: SoilEpochs::default(),
             next_index: 1,
+            unflushed: 0,
             finished_bytes: 0,
             part_number: 1,
             shared: Arc::clone(&shared),
@@ -183,6 +184,8 @@ struct Work {
     maps: HeldMaps,
     soil: SoilEpochs,
     next_index: u64,
+    /// Commands that are handed over and not yet known to be in the file.
+    unflushed: u64,
     /// Bytes of the parts before the present one.
     finished_bytes: u64,
     part_number: u32,
@@ -205,14 +208,17 @@ impl Work {
             self.shared.waiting_bytes.fetch_sub(weight, Ordering::Relaxed);
             part = result.unwrap_or_else(|error| {
                 tracing::error!(%error, "recording ended; what was written until now can be replayed");
+                self.shared.dropped.fetch_add(std::mem::take(&mut self.unflushed), Ordering::Relaxed);
                 self.end();
                 None
             });
         }
-        if let Some(part) = part
-            && let Err(error) = part.finish("stopped", self.dropped())
-        {
-            tracing::error!(%error, "recording not finished; it can be replayed as far as it goes");
+        match part.map(|part| part.finish("stopped", self.dropped())) {
+            Some(Err(error)) => {
+                tracing::error!(%error, "recording not finished; it can be replayed as far as it goes");
+                self.shared.dropped.fetch_add(self.unflushed, Ordering::Relaxed);
+            }
+            _ => self.flushed(),
         }
     }
 
@@ -239,10 +245,12 @@ impl Work {
         self.shared.bytes.store(self.finished_bytes + part.bytes(), Ordering::Relaxed);
         if flushed.elapsed() >= FLUSH_EVERY {
             part.flush()?;
+            self.flushed();
             *flushed = Instant::now();
         }
         if self.finished_bytes + part.bytes() >= self.bytes_max {
             part.finish("recording.bytes_max is reached", self.dropped())?;
+            self.flushed();
             tracing::error!(bytes_max = self.bytes_max, "recording ended: `recording.bytes_max` is reached");
             self.end();
             return Ok(None);
@@ -251,6 +259,7 @@ impl Work {
             self.finished_bytes += part.bytes();
             self.part_number += 1;
             part.finish("continued in the next part", self.dropped())?;
+            self.flushed();
             let next = Part::create(&self.folder, &self.header, self.part_number)?;
             note_part(&self.shared, next.path());
             return Ok(Some(next));
@@ -277,8 +286,13 @@ impl Work {
         for entry in asked.iter().chain(&soil).chain([&answer]) {
             part.write(&self.descriptors, sequence, time_ns, entry)?;
         }
-        self.shared.recorded.fetch_add(1, Ordering::Relaxed);
+        self.unflushed += 1;
         Ok(())
+    }
+
+    /// What was handed over is in the file.
+    fn flushed(&mut self) {
+        self.shared.recorded.fetch_add(std::mem::take(&mut self.unflushed), Ordering::Relaxed);
     }
 }
 

@@ -39,6 +39,8 @@ type Pairs = Mutex<BTreeMap<(&'static str, &'static str), u64>>;
 pub struct Metrics {
     commands: Pairs,
     measurements: Pairs,
+    /// Answers to measurements that nobody could be told, over Zenoh.
+    answers_dropped: AtomicU64,
     requests: Pairs,
     reloads: Reloads,
     events: Mutex<BTreeMap<&'static str, u64>>,
@@ -93,6 +95,11 @@ impl Metrics {
     /// Counts what became of a measurement.
     pub fn measurement(&self, transport: Transport, outcome: &'static str) {
         count(&self.measurements, (transport.label(), outcome));
+    }
+
+    /// Counts an answer to a measurement that found no room on its way to Zenoh.
+    pub fn answer_dropped(&self) {
+        self.answers_dropped.fetch_add(1, Ordering::Relaxed);
     }
 
     /// Counts a request that came over a transport.
@@ -154,6 +161,9 @@ impl Metrics {
                 let _ = writeln!(out, "{name}{{{first}=\"{a}\",{second}=\"{b}\"}} {value}");
             }
         }
+        let (name, dropped) = ("nesam_measurement_answers_dropped_total", self.answers_dropped.load(Ordering::Relaxed));
+        let help = "Answers to measurements over Zenoh that found no room on their way; vehicles send such measurements again.";
+        let _ = writeln!(out, "# HELP {name} {help}\n# TYPE {name} counter\n{name} {dropped}");
         let _ = writeln!(out, "# HELP nesam_events_total What happened to sessions.\n# TYPE nesam_events_total counter");
         if let Ok(mut events) = self.events.lock() {
             // From the start, so that the first failure is an increase.

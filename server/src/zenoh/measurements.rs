@@ -65,7 +65,7 @@ impl ReturnPath {
         let (run, durable_place) = if foreign { (0, 0) } else { self.edge.durable_place(&self.session) };
         let answer = pb::MeasurementAnswer { run, durable_place, ..measurement_answer(&self.message, &self.session, result) };
         if self.sender.try_send((self.status_key, encode(&answer))).is_err() {
-            self.edge.engine.metrics().measurement(Transport::Zenoh, "answer_dropped");
+            self.edge.engine.metrics().answer_dropped();
         }
     }
 }

@@ -5,6 +5,7 @@ use std::sync::{Arc, Mutex};
 use std::time::{Duration, Instant};
 
 use ::zenoh::sample::{Sample, SampleKind};
+use nesam_engine::check_name;
 use nesam_proto::v1 as pb;
 use tokio::sync::{Notify, mpsc};
 
@@ -13,6 +14,8 @@ use super::{Outgoing, encode, keys};
 use crate::convert::{alarm_message, effect_messages};
 use crate::grpc::Edge;
 
+/// Pause after a status, in which vehicles that come and go make one more and not one each.
+const CHANGES_EVERY: Duration = Duration::from_millis(100);
 /// Tokens that are remembered; a network that shows more is not one of vehicles.
 const VEHICLES_MAX: usize = 4096;
 
@@ -48,6 +51,10 @@ impl Presence {
     }
 
     fn note(&self, vehicle: &str, alive: bool) {
+        // A token that no vehicle can have is none.
+        if check_name("vehicle_id", vehicle).is_err() {
+            return;
+        }
         let Ok(mut vehicles) = self.alive.lock() else { return };
         let changed = if alive { vehicles.len() < VEHICLES_MAX && vehicles.insert(vehicle.into()) } else { vehicles.remove(vehicle) };
         drop(vehicles);
@@ -118,5 +125,6 @@ pub async fn publish_status(
         if sender.send((status_key.clone(), encode(&status))).await.is_err() {
             return;
         }
+        tokio::time::sleep(CHANGES_EVERY).await;
     }
 }

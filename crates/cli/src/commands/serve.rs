@@ -172,7 +172,10 @@ fn configuration(args: &ServeArgs) -> Result<Config, Failure> {
     if let Some(name) = &args.server_name {
         config.cluster.name.clone_from(name);
     }
-    config.check().or_input()?;
+    config.check().map_err(|error| match &args.config {
+        Some(file) => Failure::input(format!("{}, with the options of the command: {error}", file.display())),
+        None => Failure::input(error.to_string()),
+    })?;
     Ok(config)
 }
 
