@@ -57,6 +57,8 @@ def serve(plug):
         number = request["id"]
         if sender == client and number < last["id"]:  # a late copy: it has been answered long ago
             continue
+        if sender != client:  # somebody else begins with a reset
+            plant = Bicycle()
         if sender != client or number > last["id"]:  # else asked again: answer again, move nothing
             last, client = {"nesam_plant": 1, "id": number, **answer(plant, request)}, sender
         plug.sendto(json.dumps(last).encode(), sender)

@@ -24,6 +24,9 @@ pub enum NavigationError {
         /// What was wrong.
         reason: String,
     },
+    /// Whoever drives has been told to stop.
+    #[error("interrupted")]
+    Interrupted,
     /// The built-in plant cannot be made.
     #[error(transparent)]
     BuiltIn(#[from] nesam_plant::PlantError),

@@ -10,7 +10,7 @@ use crate::error::NavigationError;
 use crate::forecast::{Forecaster, Situation};
 use crate::link::{PlantLink, Reading, Start};
 use crate::mppi::{Mppi, MppiSettings};
-use crate::plausibility::{TurnCheck, VelocityCheck, usable};
+use crate::plausibility::{OVERTURNED, TurnCheck, VelocityCheck, usable};
 use crate::reference_path::{ReferencePath, distance_to_line, hausdorff_m, unwrapped};
 use crate::tracker::TrackingCost;
 
@@ -26,6 +26,8 @@ const OFF_PATH_MAX_M: f64 = 5.0;
 const TIME_FACTOR: f64 = 1.5;
 /// Distance between points of the reference for the Hausdorff distance, m.
 const REFERENCE_STEP_M: f64 = 0.1;
+/// Ends of laps that the driving alone makes: the vehicle was let drive until then.
+pub(crate) const OWN_ENDS: [&str; 3] = ["complete", "off_path", "too_slow"];
 /// Commands that are remembered for models that want them.
 const PAST_MAX: usize = 32;
 
@@ -116,6 +118,10 @@ pub struct Lap {
     /// Correlation of the commanded second with the measured yaw rate above 1 m/s: near -1 where the vehicle turns the other way; `None` where it hardly turned.
     #[serde(default)]
     pub turn_correlation: Option<f64>,
+    /// Mean horizontal distance of the measured positions from the true ones, m: noise of the sensors, or another point or frame; `None` where the plant does not tell the
+    /// truth.
+    #[serde(default)]
+    pub measured_off_m: Option<f64>,
     /// x, y driven from the beginning of the lap to its end, every 0.1 s, m; every 0.2 s in a lap that an earlier version has kept.
     pub path: Vec<[f64; 2]>,
     /// How the vehicle leant, every 0.1 s.
@@ -139,11 +145,17 @@ impl Lap {
         !self.lean.is_empty()
     }
 
+    /// Whether the vehicle was let drive until it had come round, left the path, was too slow or overturned: of a lap that ended otherwise nobody knows how far off the path
+    /// the rest of it would have been.
+    pub fn is_driven_out(&self) -> bool {
+        OWN_ENDS.contains(&self.end.as_str()) || self.end == OVERTURNED
+    }
+
     /// Leaves out what is told of a lap that was not driven: an earlier version kept zeros for it, and the place where it was to begin.
     pub(crate) fn without_inventions(mut self) -> Self {
         if !self.is_begun() {
             (self.hausdorff_m, self.hausdorff_whole_path_m, self.off_path_mean_m) = (None, None, None);
-            (self.roll_deg, self.pitch_deg) = (None, None);
+            (self.roll_deg, self.pitch_deg, self.measured_off_m) = (None, None, None);
             self.path.clear();
         }
         self
@@ -291,6 +303,8 @@ struct Track {
     /// The whole path.
     whole: Vec<[f64; 2]>,
     scored: Scored,
+    measured_off_sum_m: f64,
+    readings: usize,
     velocity: VelocityCheck,
     turns: TurnCheck,
     /// How the lap ended before its time: the vehicle or its simulation is beyond driving.
@@ -310,6 +324,8 @@ impl Track {
             lean: Vec::new(),
             whole: plan.path.points_between(0.0, std::f64::consts::TAU, REFERENCE_STEP_M),
             scored: Scored::Truth,
+            measured_off_sum_m: 0.0,
+            readings: 0,
             velocity: VelocityCheck::default(),
             turns: TurnCheck::default(),
             ended: None,
@@ -325,9 +341,11 @@ impl Track {
 
     /// What is kept of every reading beside its place.
     fn note(&mut self, reading: &Reading) {
-        if reading.truth.is_none() {
-            self.scored = Scored::State;
+        match &reading.truth {
+            None => self.scored = Scored::State,
+            Some(truth) => self.measured_off_sum_m += (reading.measured[0] - truth[0]).hypot(reading.measured[1] - truth[1]),
         }
+        self.readings += 1;
         self.velocity.add(&reading.measured);
     }
 
@@ -385,6 +403,7 @@ impl Track {
             velocity_mismatch_m_s: self.velocity.mismatch_m_s(),
             moved_over_told: self.velocity.moved_over_told(),
             turn_correlation: self.turns.correlation(),
+            measured_off_m: (self.scored == Scored::Truth && self.readings > 0).then(|| self.measured_off_sum_m / self.readings as f64),
             path: self.positions.clone(),
             lean: self.lean.clone(),
         };

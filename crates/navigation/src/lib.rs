@@ -35,7 +35,7 @@ pub use mppi::{Decision, Mppi, MppiSettings};
 pub use oracle::SoilAhead;
 pub use reference_path::ReferencePath;
 pub use remote::RemotePlant;
-pub use report::{NavigationReport, SoilKind};
+pub use report::{NavigationReport, SoilKind, lost};
 pub use score::{Figures, Ratio, Run, Summary, configuration_names, lap_file_name, ratio, summarise};
 pub use session::{ServedForecaster, session_request};
 pub use tracker::TrackingCost;

@@ -33,6 +33,10 @@ const LEFT_BY_FACTOR: f64 = 0.5;
 const TURNING_ABOVE_M_S: f64 = 1.0;
 const TURNING_STEPS_MIN: usize = 15;
 const TURNING_MIN_RAD_S: f64 = 0.03;
+/// A vehicle that moves sideways by more than this share of its speed slides, wherever its wheels point (the reference point of a car in a sharp turn: a fifth).
+const SLIDES: f64 = 0.25;
+/// How a lap ends beyond 90 degrees of roll or pitch.
+pub(crate) const OVERTURNED: &str = "overturned";
 
 /// The reading of an answer that a lap can go on with; else how the lap ends: `plant_lost` where a number is none or beyond what a vehicle does, `overturned`
 /// beyond 90 degrees of roll or pitch, or what the plant says.
@@ -45,7 +49,7 @@ pub(crate) fn usable(answer: &Answer) -> Result<Reading, String> {
         return Err("plant_lost".into());
     }
     let [_, _, _, roll, pitch, ..] = *reading.scored();
-    if roll.abs().max(pitch.abs()) > FRAC_PI_2 { Err("overturned".into()) } else { Ok(reading) }
+    if roll.abs().max(pitch.abs()) > FRAC_PI_2 { Err(OVERTURNED.into()) } else { Ok(reading) }
 }
 
 /// False of a number that is none, too.
@@ -114,8 +118,8 @@ pub(crate) struct TurnCheck {
 impl TurnCheck {
     /// A command, and what was measured at the end of its step.
     pub(crate) fn add(&mut self, command: Control<f64>, measured: &[f64; 12]) {
-        let (speed_m_s, rate_rad_s) = (measured[6], measured[11]);
-        if speed_m_s < TURNING_ABOVE_M_S {
+        let (speed_m_s, sideways_m_s, rate_rad_s) = (measured[6], measured[7], measured[11]);
+        if speed_m_s < TURNING_ABOVE_M_S || sideways_m_s.abs() > SLIDES * speed_m_s {
             return;
         }
         self.steps += 1;
@@ -209,19 +213,21 @@ mod tests {
     }
 
     /// Goal: a vehicle that turns right where it is told to turn left is seen, one that answers late, slides or stands is not. Method: commands of a sinusoid, yaw
-    /// rates that follow them 0.3 s later, with either sign, without any and at little speed.
+    /// rates that follow them 0.3 s later, with either sign, without any, at little speed and sliding down a slope.
     #[test]
     fn regress_reversed_steering_is_seen() {
-        let driven = |gain: f64, speed_m_s: f64, steps: u32| {
+        let sliding = |gain: f64, speed_m_s: f64, sideways_m_s: f64, steps: u32| {
             let command = |k: u32| 0.3 + 0.4 * (0.1 * f64::from(k)).sin();
             let mut check = TurnCheck::default();
             for k in 3..3 + steps {
                 let mut measured = [0.0; 12];
-                (measured[6], measured[11]) = (speed_m_s, gain * command(k - 3));
+                (measured[6], measured[7], measured[11]) = (speed_m_s, sideways_m_s, gain * command(k - 3));
                 check.add(Control { speed_m_s, second: command(k) }, &measured);
             }
             check.correlation()
         };
+        let driven = |gain: f64, speed_m_s: f64, steps: u32| sliding(gain, speed_m_s, 0.15 * speed_m_s, steps);
+        assert_eq!(sliding(-0.3, 3.0, -1.0, 40), None);
         assert!(driven(0.3, 3.0, 40).is_some_and(|r| r > 0.8));
         assert!(driven(-0.3, 3.0, 40).is_some_and(|r| r < -0.8));
         assert_eq!([driven(0.0, 3.0, 40), driven(-0.3, 0.9, 40), driven(-0.3, 3.0, 14)], [None; 3]);

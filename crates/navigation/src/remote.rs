@@ -9,6 +9,7 @@ use nesam_physics::{Control, wrap_angle};
 use serde_json::{Value, json};
 
 use crate::error::NavigationError;
+use crate::lap::OWN_ENDS;
 use crate::link::{Answer, PlantLink, Reading, Start};
 use crate::plant_message::{read_json, twelve};
 
@@ -35,6 +36,10 @@ pub struct RemotePlant {
     timeout: Duration,
     /// What the plant calls itself.
     name: Option<String>,
+    /// Whether it tells the truth since `reset`.
+    tells_truth: bool,
+    /// Whether nobody waits for answers any more.
+    given_up: fn() -> bool,
     /// Told of a plant that is silent.
     tell: Option<fn(&str)>,
     /// Whether it has been told since the plant last answered soon.
@@ -58,13 +63,30 @@ impl RemotePlant {
         let socket = UdpSocket::bind(if to.is_ipv4() { "0.0.0.0:0" } else { "[::]:0" }).map_err(failed)?;
         socket.connect(to).map_err(failed)?;
         socket.set_read_timeout(Some(ASK_AGAIN)).map_err(failed)?;
-        Ok(Self { address: address.into(), socket, number: first_number, timeout, name: None, tell: None, told: false, prepared: None })
+        Ok(Self {
+            address: address.into(),
+            socket,
+            number: first_number,
+            timeout,
+            name: None,
+            tells_truth: false,
+            given_up: || false,
+            tell: None,
+            told: false,
+            prepared: None,
+        })
     }
 
     /// Tells, once in a silence of five seconds, that nothing is heard and what is heard instead. A plant that always takes longer is told of once.
     #[must_use]
     pub fn telling(self, tell: fn(&str)) -> Self {
         Self { tell: Some(tell), ..self }
+    }
+
+    /// Waits for no answer once this says so.
+    #[must_use]
+    pub fn until(self, given_up: fn() -> bool) -> Self {
+        Self { given_up, ..self }
     }
 
     fn wrong(&self, reason: impl Into<String>) -> NavigationError {
@@ -85,7 +107,7 @@ impl RemotePlant {
         let mut strays = Strays::default();
         let mut begin = Instant::now();
         let asked = begin;
-        while begin.elapsed() < self.timeout {
+        while begin.elapsed() < self.timeout && !(self.given_up)() {
             let sent = Instant::now();
             // Where nobody listens yet the datagram is refused at once; the plant may still come.
             let mut failed = self.socket.send(datagram.as_bytes()).err();
@@ -117,6 +139,9 @@ impl RemotePlant {
             let left = self.timeout.saturating_sub(begin.elapsed());
             std::thread::sleep(ASK_AGAIN.saturating_sub(sent.elapsed()).min(left));
         }
+        if (self.given_up)() {
+            return Err("interrupted".into());
+        }
         Err(format!("no answer within {} s{}", self.timeout.as_secs_f64(), strays.text()))
     }
 
@@ -131,13 +156,15 @@ impl RemotePlant {
         if let Some(version) = reply.get("nesam_plant").filter(|v| v.as_f64() != Some(VERSION as f64)) {
             return Err(self.wrong(format!("it speaks version {version} of the protocol, this program version {VERSION}")));
         }
-        if let Some(reason) = reply.get("error").filter(|v| !v.is_null()) {
+        let is_none =
+            |error: &Value| matches!(error, Value::Null | Value::Bool(false)) || error.as_str().is_some_and(|text| text.trim().is_empty());
+        if let Some(reason) = reply.get("error").filter(|error| !is_none(error)) {
             return Err(self.wrong(reason.as_str().map_or_else(|| reason.to_string(), printable)));
         }
         match &reply["ended"] {
             Value::Null | Value::Bool(false) => {}
             Value::String(why) if !why.trim().is_empty() => {
-                return Ok(Answer::Ended(printable(&why.trim().chars().take(END_MAX).collect::<String>())));
+                return Ok(Answer::Ended(end_of_plant(why.trim())));
             }
             _ => return Ok(Answer::Ended("plant_lost".into())),
         }
@@ -155,20 +182,30 @@ impl RemotePlant {
         Ok(Answer::Reading(Reading { measured, truth }))
     }
 
-    /// The vehicle has to be where it was asked to be; a number that is none is the end of the lap and no matter of place.
+    /// The vehicle has to be where it was asked to be, as it is measured and in truth; a number that is none is the end of the lap and no matter of place.
     fn check_place(&self, start: &Start, answer: &Answer) -> Result<(), NavigationError> {
-        let Some(Reading { measured, .. }) = answer.reading().filter(|r| r.measured.iter().all(|v| v.is_finite())) else { return Ok(()) };
+        let Some(Reading { measured, truth }) = answer.reading() else { return Ok(()) };
+        let told = [("state", Some(measured)), ("truth", truth)];
+        told.into_iter()
+            .filter_map(|(name, state)| Some((name, state?)))
+            .try_for_each(|(name, state)| self.check_placed(start, name, &state))
+    }
+
+    fn check_placed(&self, start: &Start, name: &str, state: &[f64; 12]) -> Result<(), NavigationError> {
+        if !state.iter().all(|v| v.is_finite()) {
+            return Ok(());
+        }
         let [x_m, y_m] = start.position_m;
         let [within_m, within_rad] = PLACED_WITHIN;
-        let channels = [("x", measured[0], x_m, within_m), ("y", measured[1], y_m, within_m)];
+        let channels = [("x", state[0], x_m, within_m), ("y", state[1], y_m, within_m)];
         let off = channels.into_iter().find(|(_, is, asked, within)| (is - asked).abs() > *within);
         // As it came: a yaw of 90 is 90, and not the angle of a turn that it is taken for.
-        let turned = wrap_angle(measured[5] - start.yaw_rad).abs() > within_rad;
-        let off = off.or(turned.then_some(("yaw", measured[5], start.yaw_rad, within_rad)));
+        let turned = wrap_angle(state[5] - start.yaw_rad).abs() > within_rad;
+        let off = off.or(turned.then_some(("yaw", state[5], start.yaw_rad, within_rad)));
         off.map_or(Ok(()), |(channel, is, asked, within)| {
             let doubt = if channel == "yaw" && is.abs() > TAU { " (degrees?)" } else { "" };
             Err(self.wrong(format!(
-                "after `reset` {channel} reads {is:.3}{doubt} where {asked:.3} was asked for (within {within}): `state` begins with x, y, z of the reference point in \
+                "after `reset` {channel} of `{name}` reads {is:.3}{doubt} where {asked:.3} was asked for (within {within}): `{name}` begins with x, y, z of the reference point in \
                  World, in m, and roll, pitch, yaw in rad"
             )))
         })
@@ -176,11 +213,12 @@ impl RemotePlant {
 
     /// One campaign is one plant: another name is another plant at the same address.
     fn note_name(&mut self, reply: &Value) -> Result<(), NavigationError> {
-        let Some(name) = reply["plant"].as_str() else { return Ok(()) };
+        // A name that says nothing is none: any plant could have it.
+        let Some(name) = reply["plant"].as_str().map(str::trim).filter(|name| !name.is_empty()).map(printable) else { return Ok(()) };
         if let Some(before) = self.name.as_deref().filter(|before| *before != name) {
-            return Err(self.wrong(format!("it calls itself `{}` and was `{}` before", printable(name), printable(before))));
+            return Err(self.wrong(format!("it calls itself `{name}` and was `{before}` before")));
         }
-        self.name = Some(name.into());
+        self.name = Some(name);
         Ok(())
     }
 }
@@ -199,6 +237,7 @@ impl PlantLink for RemotePlant {
         let answer = self.answer(&reply)?;
         self.note_name(&reply)?;
         self.check_place(start, &answer)?;
+        self.tells_truth = answer.reading().is_some_and(|reading| reading.truth.is_some());
         Ok(answer)
     }
 
@@ -207,7 +246,16 @@ impl PlantLink for RemotePlant {
         let reply = self.ask(request).map_err(|reason| self.lost(reason))?;
         match reply["error"].as_str() {
             Some(reason) if reason.contains(RESET_FIRST) => Err(self.lost(printable(reason))),
-            _ => self.answer(&reply),
+            _ => {
+                let answer = self.answer(&reply)?;
+                // A lap is scored by one of the two; where a number is none it is over.
+                let mixed =
+                    |reading: Reading| reading.truth.is_some() != self.tells_truth && reading.measured.iter().all(|v| v.is_finite());
+                if answer.reading().is_some_and(mixed) {
+                    return Err(self.wrong("`truth` is told in some answers and not in others: tell it in all since `reset`, or in none"));
+                }
+                Ok(answer)
+            }
         }
     }
 
@@ -218,10 +266,16 @@ impl PlantLink for RemotePlant {
     }
 }
 
-/// A text of a plant on one line, with its control characters as they are written in programs.
+/// A text of a plant on one line, with what does not print as it is written in programs.
 fn printable(text: &str) -> String {
-    let escaped = |c: char| if c.is_control() { c.escape_default().to_string() } else { c.to_string() };
+    let escaped = |c: char| if matches!(c, '\'' | '"' | '\\') { c.to_string() } else { c.escape_debug().to_string() };
     text.chars().map(escaped).collect()
+}
+
+/// The end that a plant makes of a lap, in its words; ends that this program finds are not for it to tell.
+fn end_of_plant(why: &str) -> String {
+    let why = printable(&why.chars().take(END_MAX).collect::<String>());
+    if OWN_ENDS.contains(&why.as_str()) { format!("the plant said: {why}") } else { why }
 }
 
 /// What came from the plant's address and answered nothing.

@@ -47,13 +47,17 @@ impl SoilKind {
 const BASE: &str = "fixed";
 /// Ends of laps that are told of a configuration.
 const ENDS_MAX: usize = 5;
-/// Quantities that are compared: distances over the part that each drove, angles over the part that both drove.
+/// Quantities that are compared: distances over the part that each drove, of laps that were driven out, angles over the part that both drove.
 const COMPARED: [(&str, fn(&Lap, f64) -> Option<f64>); 4] = [
-    ("hausdorff_m", |lap, _| lap.hausdorff_m),
-    ("off_path_m", |lap, _| lap.off_path_mean_m),
+    ("hausdorff_m", driven_out_hausdorff_m),
+    ("off_path_m", |lap, _| lap.off_path_mean_m.filter(|_| lap.is_driven_out())),
     ("roll_deg", roll_deg),
     ("pitch_deg", pitch_deg),
 ];
+
+fn driven_out_hausdorff_m(lap: &Lap, _: f64) -> Option<f64> {
+    lap.hausdorff_m.filter(|_| lap.is_driven_out())
+}
 
 fn roll_deg(lap: &Lap, progress: f64) -> Option<f64> {
     lap.mean_lean_until(progress, |lean| lean.roll_deg)
@@ -72,6 +76,8 @@ pub struct NavigationReport {
     pub settings: Value,
     /// Folder with a file for each lap: its path, and how the vehicle leant on it.
     pub folder: PathBuf,
+    /// What is doubtful about them, a sentence each.
+    pub warnings: Vec<String>,
     /// What the numbers were made from: name and value, for JSON and footer.
     pub provenance: Vec<(String, String)>,
 }
@@ -109,6 +115,7 @@ impl NavigationReport {
             "runs": configuration_names(&self.runs).iter().map(of).max().unwrap_or(0),
             "laps": self.runs.len(),
             "configurations": configurations,
+            "warnings": self.warnings,
             "settings": self.settings,
             "provenance": provenance,
             "each": each.collect::<Vec<_>>(),
@@ -149,7 +156,7 @@ impl NavigationReport {
                     mean_sd(&s.off_path_m, 2),
                     mean_sd(&s.roll_deg, 2),
                     mean_sd(&s.pitch_deg, 2),
-                    over_fixed(|lap, _| lap.hausdorff_m),
+                    over_fixed(driven_out_hausdorff_m),
                     over_fixed(roll_deg),
                     over_fixed(pitch_deg),
                 ]);
@@ -166,12 +173,6 @@ impl NavigationReport {
             (!incomplete.is_empty()).then(|| format!("{name}: {}", ends_text(&incomplete)))
         };
         configuration_names(&self.runs).iter().filter_map(of).collect()
-    }
-
-    /// Configurations of which every lap is lost: that is no way to drive, but a simulation that diverges or readings that are none.
-    pub fn lost(&self) -> Vec<String> {
-        let all_lost = |name: &String| self.runs.iter().filter(|run| run.configuration == *name).all(|run| run.lap.end == "plant_lost");
-        configuration_names(&self.runs).into_iter().filter(all_lost).collect()
     }
 
     /// Heads of the columns of [`NavigationReport::rows`].
@@ -201,13 +202,23 @@ impl NavigationReport {
         );
         let mut page = Page::new("Closed-loop driving", &lead);
         let mut table = Table::new(
-            "Completed = the whole lap in time, never more than 5 m off. Time over completed laps only; |roll| and |pitch| over fixed on the part that both laps of a pair drove.",
+            "Completed = the whole lap in time, never more than 5 m off. Time over completed laps only; |roll| and |pitch| over fixed on the part that both laps of a pair drove, distances of laps \
+             that no plant ended.",
             &Self::HEAD,
         );
         for row in self.rows() {
             table.row(row.into_iter().map(Into::into).collect());
         }
         page.section("What came of it").table(&table);
+        for ends in self.ends() {
+            page.text(&format!("Not completed by {ends}."));
+        }
+        if !self.warnings.is_empty() {
+            page.section("What is doubtful");
+            for warning in &self.warnings {
+                page.text(warning);
+            }
+        }
         let path = ReferencePath::of_ood_soil();
         let reference: Vec<(f64, f64)> = path.points_between(0.0, std::f64::consts::TAU, 0.5).iter().map(|[x, y]| (*x, *y)).collect();
         let mut worlds: Vec<(&str, SoilKind)> = self.runs.iter().map(|r| (r.world.as_str(), r.soil)).collect();
@@ -239,6 +250,12 @@ impl NavigationReport {
         }
         plot
     }
+}
+
+/// Configurations of which every lap is lost: that is no way to drive, but a simulation that diverges or readings that are none.
+pub fn lost(runs: &[Run]) -> Vec<String> {
+    let all_lost = |name: &String| runs.iter().filter(|run| run.configuration == *name).all(|run| run.lap.end == "plant_lost");
+    configuration_names(runs).into_iter().filter(all_lost).collect()
 }
 
 fn of_summary(s: &Summary) -> Value {
@@ -309,7 +326,7 @@ mod tests {
     use crate::score::tests::{never_begun, run};
 
     fn report(runs: Vec<Run>) -> NavigationReport {
-        NavigationReport { runs, settings: json!({}), folder: "laps".into(), provenance: Vec::new() }
+        NavigationReport { runs, settings: json!({}), folder: "laps".into(), warnings: Vec::new(), provenance: Vec::new() }
     }
 
     /// Goal: who reads the table learns why laps were not completed. Method: laps that end in several ways, and none that is complete but one.
@@ -328,7 +345,7 @@ mod tests {
             told.ends(),
             ["fixed: off_path 2 (at 3.4 s), spawn blocked 1 (before the lap began)", "adapted: plant_lost 2 (at 2.0 to 12.0 s)"]
         );
-        assert_eq!(told.lost(), ["adapted"]);
+        assert_eq!(lost(&told.runs), ["adapted"]);
         runs.extend((0..6).map(|i| ended("oracle", i, &format!("ditch {i}"), 1.0)));
         let told = report(runs).ends();
         assert!(told[2].starts_with("oracle: ditch 0 1 (at 1.0 s), ") && told[2].ends_with(", other ends 1"), "{told:?}");
@@ -384,6 +401,18 @@ mod tests {
         assert_eq!(value["each"][0]["lap"]["hausdorff_whole_path_m"], 20.0);
         let html = report.page().render();
         assert!(html.contains("path to follow") && html.contains("off_path") && !html.contains("http://"));
+    }
+
+    /// Goal: a lap that the plant ended early on is not one that kept to the path. Method: a ditch after a tenth of the distance, beside a lap that was driven out.
+    #[test]
+    fn regress_laps_that_a_plant_ended_are_in_no_ratio_of_distances() {
+        let mut runs = vec![run("fixed", "a", 0, 1, 2.0, true), run("adapted", "a", 0, 1, 0.1, false)];
+        runs[1].lap.end = "in a ditch".into();
+        let over = |runs: &[Run]| report(runs.to_vec()).to_json()["configurations"]["adapted"]["over_fixed"]["all"].clone();
+        let ended = over(&runs);
+        assert!(ended["hausdorff_m"].is_null() && ended["off_path_m"].is_null() && ended["roll_deg"]["ratio"] == 1.0, "{ended}");
+        runs[1].lap.end = "off_path".into();
+        assert_eq!(over(&runs)["hausdorff_m"]["ratio"], 0.05);
     }
 
     /// Goal: a mean over the whole path is one of all laps or none. Method: a lap that an earlier version has kept among others.

@@ -210,6 +210,7 @@ pub(crate) mod tests {
             velocity_mismatch_m_s: None,
             moved_over_told: None,
             turn_correlation: None,
+            measured_off_m: None,
             path: vec![[23.5, 0.0], [23.0, 2.0]],
             lean: vec![Lean { progress: 1.0, roll_deg: 2.0, pitch_deg: 3.0 }],
         };

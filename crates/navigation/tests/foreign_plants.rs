@@ -67,7 +67,8 @@ fn service_a_vehicle_that_is_lost_ends_its_lap() {
         (state(3, "3.05"), "overturned"),
         (state(4, "-1.6"), "overturned"),
         (r#"{"state": null, "ended": "on its roof"}"#, "on its roof"),
-        (r#"{"ended": "complete"}"#, "complete"),
+        (r#"{"ended": "complete"}"#, "the plant said: complete"),
+        ("{\"ended\": \"rolled\\u001b\\u202e\"}", r"rolled\u{1b}\u{202e}"),
         (r#"{"ended": true}"#, "plant_lost"),
     ];
     for from in [FAILS_AT, 3, 0] {
@@ -110,9 +111,10 @@ fn service_answers_of_another_form_are_refused() {
         (r#"{"truth": [0,0,0,0,0,0,0,0,0,0,0,null]}"#, "`truth`"),
         (r#"{"truth": "none"}"#, "`truth`"),
         (r#"{"state": [0,0,0]}"#, "`state`"),
-        (r#"{"state": [23.5,-0.9,0.6,0,0,1.57,0,0,0,0,0,0]}"#, "y reads -0.900 where -2.250"),
-        (r#"{"state": [23.5,-2.25,0.6,0,0,0.1,0,0,0,0,0,0]}"#, "yaw reads 0.100 where 1.570"),
-        (r#"{"state": [23.5,-2.25,0.6,0,0,90.1,0,0,0,0,0,0]}"#, "yaw reads 90.100 (degrees?) where 1.570"),
+        (r#"{"state": [23.5,-0.9,0.6,0,0,1.57,0,0,0,0,0,0]}"#, "y of `state` reads -0.900 where -2.250"),
+        (r#"{"state": [23.5,-2.25,0.6,0,0,0.1,0,0,0,0,0,0]}"#, "yaw of `state` reads 0.100 where 1.570"),
+        (r#"{"state": [23.5,-2.25,0.6,0,0,90.1,0,0,0,0,0,0]}"#, "yaw of `state` reads 90.100 (degrees?) where 1.570"),
+        (r#"{"truth": [23.5,0.75,0.6,0,0,1.57,0,0,0,0,0,0]}"#, "y of `truth` reads 0.750 where -2.250"),
         (r#"{"error": "solver\nexploded"}"#, r"solver\nexploded"),
     ] {
         let address = spoilt(0, part);
@@ -280,4 +282,42 @@ fn regress_steps_of_another_time_and_reversed_steering_are_seen() {
         "{:?}",
         reversed.turn_correlation
     );
+}
+
+/// Goal: a lap is scored by one of state and truth, of one point. Method: truth that is left out on the way or told from there on, errors that are none, and truth 0.8 m from
+/// the state.
+#[test]
+fn service_truth_is_told_always_or_never() {
+    let truthful = |tells: fn(usize) -> bool, off_m: f64| {
+        bicycle(move |_, steps, mut reply| {
+            if tells(steps) {
+                reply["truth"] = reply["state"].clone();
+                reply["truth"][1] = json!(reply["state"][1].as_f64().unwrap() + off_m);
+            }
+            (reply["error"], reply["ended"]) = (json!(""), json!(steps == FAILS_AT + 30));
+            vec![reply.to_string()]
+        })
+    };
+    for tells in [|steps| steps < FAILS_AT, |steps| steps >= FAILS_AT] {
+        let error = lap_on(&mut connect(&truthful(tells, 0.0)), "w05", 1).unwrap_err().to_string();
+        assert!(error.contains("`truth` is told in some answers and not in others"), "{error}");
+    }
+    let lap = |tells, off_m| lap_on(&mut connect(&truthful(tells, off_m)), "w05", 1).unwrap();
+    let off = lap(|_| true, 0.8);
+    assert!(off.scored == Scored::Truth && off.measured_off_m.is_some_and(|m| (m - 0.8).abs() < 1e-6), "{:?}", off.measured_off_m);
+    assert!(!off.is_driven_out() && lap(|_| false, 0.0).measured_off_m.is_none());
+}
+
+/// Goal: a name that says nothing is none, or laps of any plant would be taken for those of another. Method: blank names and one with signs that do not print.
+#[test]
+fn service_a_blank_name_is_none() {
+    let named = |name: &'static str| {
+        let address = bicycle(move |_, _, mut reply| {
+            reply["plant"] = name.into();
+            vec![reply.to_string()]
+        });
+        connect(&address).name(&start()).unwrap()
+    };
+    assert_eq!([named(""), named("  ")], [None, None]);
+    assert_eq!(named(" mine\n\u{202e} ").as_deref(), Some(r"mine\n\u{202e}"));
 }

@@ -106,7 +106,10 @@ fn moves_once(mut ask: impl FnMut(usize, &str) -> Option<Value>) {
     assert!(ask(0, &step(11)).is_none() && ask(0, reset).is_none(), "late copies get no answer");
     assert_eq!(ask(0, &step(12)).unwrap(), after, "and have moved nothing");
     let elsewhere = ask(1, &step(12)).unwrap();
-    assert_ne!(elsewhere["state"], after["state"], "another client's 12 is not this one's");
+    assert_eq!(elsewhere["error"], "reset comes first", "another client's vehicle is not this one's to move");
+    let again = ask(1, &reset.replace("10", "13")).unwrap();
+    assert_eq!(again["state"], first["state"], "another client's vehicle is set down anew");
+    assert!(ask(1, &step(14)).unwrap()["state"].is_array());
 }
 
 /// Goal: a datagram that the network delivers twice, late, does not move the vehicle. Method: the same conversation with the built-in plant and with the stub

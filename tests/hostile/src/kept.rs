@@ -147,7 +147,7 @@ pub fn checkpoint_arrays(bytes: &[u8]) {
 pub fn kept_lap(bytes: &[u8]) {
     let Ok(KeptLap { settings, run }) = KeptLap::from_json(bytes) else { return };
     let other = nesam_navigation::Run { configuration: "fixed".into(), ..run.clone() };
-    let report = NavigationReport { runs: vec![run, other], settings, folder: "laps".into(), provenance: Vec::new() };
+    let report = NavigationReport { runs: vec![run, other], settings, folder: "laps".into(), warnings: Vec::new(), provenance: Vec::new() };
     drop((report.rows(), report.to_json(), report.page().render()));
 }
 

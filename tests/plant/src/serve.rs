@@ -35,18 +35,18 @@ impl Request {
     /// The number as far as it was readable, and what was wrong.
     pub fn parse(datagram: &[u8]) -> Result<(u64, Self), (u64, String)> {
         let json: Value = serde_json::from_slice(datagram).map_err(|e| (0, format!("not JSON: {e}")))?;
-        let id = json.get("id").and_then(Value::as_u64).ok_or((0, "`id` is missing".to_string()))?;
+        let id = json.get("id").and_then(whole).ok_or((0, "`id` is missing".to_string()))?;
         let number = |key: &str| {
             let value = json.get(key).and_then(Value::as_f64).filter(|v| v.is_finite() && v.abs() < 1e6);
             value.ok_or_else(|| (id, format!("`{key}` must be a number")))
         };
-        if json.get("nesam_plant").and_then(Value::as_u64) != Some(VERSION) {
+        if json.get("nesam_plant").and_then(whole) != Some(VERSION) {
             return Err((id, format!("`nesam_plant` must be {VERSION}")));
         }
         match json.get("type").and_then(Value::as_str) {
             Some("reset") => {
                 let world = json.get("world").and_then(Value::as_str).ok_or((id, "`world` is missing".to_string()))?;
-                let seed = json.get("seed").and_then(Value::as_u64).ok_or((id, "`seed` must be a whole number".to_string()))?;
+                let seed = json.get("seed").and_then(whole).ok_or((id, "`seed` must be a whole number".to_string()))?;
                 let pose = [number("x_m")?, number("y_m")?, number("yaw_rad")?];
                 Ok((id, Self::Reset { world: world.into(), seed, pose }))
             }
@@ -54,6 +54,12 @@ impl Request {
             _ => Err((id, "`type` must be reset or step".into())),
         }
     }
+}
+
+/// A whole number, also one that is written `30.0`.
+fn whole(value: &Value) -> Option<u64> {
+    let of_float = || value.as_f64().filter(|v| v.fract() == 0.0 && (0.0..9_007_199_254_740_992.0).contains(v)).map(|v| v as u64);
+    value.as_u64().or_else(of_float)
 }
 
 /// A reply.
@@ -88,7 +94,7 @@ impl PlantServer {
     }
 
     /// The answer to one datagram. The same number from the same sender asked again gets the same answer and moves nothing; a smaller one is a late copy and gets
-    /// none. Another sender begins another conversation.
+    /// none. Another sender begins another conversation, with `reset`.
     pub fn answer(&mut self, from: SocketAddr, datagram: &[u8]) -> Option<Answer> {
         let (id, request) = match Request::parse(datagram) {
             Ok(parsed) => parsed,
@@ -96,6 +102,10 @@ impl PlantServer {
         };
         if let Some(last) = self.last.as_ref().filter(|last| last.from == from && id <= last.id) {
             return (id == last.id).then(|| last.answer.clone());
+        }
+        // Somebody else's vehicle is not theirs to move.
+        if matches!(request, Request::Step(_)) && self.last.as_ref().is_some_and(|last| last.from != from) {
+            return Some(error(id, "reset comes first"));
         }
         let answer = match self.carry_out(request) {
             Ok(reading) => {

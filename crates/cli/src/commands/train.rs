@@ -2,7 +2,6 @@
 
 use std::path::{Path, PathBuf};
 use std::sync::Mutex;
-use std::sync::atomic::{AtomicBool, Ordering};
 
 use clap::Args;
 use nesam_evaluation::Baselines;
@@ -17,6 +16,7 @@ use crate::args::{DataArgs, SplitArg, check_count, horizon_of};
 use crate::cli::command_without_paths;
 use crate::environment::{PURGE_DELAY, restart_with};
 use crate::failure::{Failure, OrFail};
+use crate::interrupt::{is_noted, note_ctrl_c};
 use crate::output::{hold, note, out_place};
 use crate::progress::Progress;
 use crate::sources::{bundle_to_change, read_drives};
@@ -132,24 +132,6 @@ impl Reporter for Console {
     }
 }
 
-static INTERRUPTED: AtomicBool = AtomicBool::new(false);
-
-/// The first Ctrl-C asks for a checkpoint after the step in work, or before the first step for an end after what is in work; the second ends the program at once.
-fn stop_on_ctrl_c() {
-    std::thread::spawn(|| {
-        let Ok(runtime) = tokio::runtime::Builder::new_current_thread().enable_io().build() else { return };
-        runtime.block_on(async {
-            while tokio::signal::ctrl_c().await.is_ok() {
-                if INTERRUPTED.swap(true, Ordering::SeqCst) {
-                    note!("\nstopped at once: what was done since the last checkpoint is lost");
-                    std::process::exit(1);
-                }
-                note!("\nstopping after this step; Ctrl-C again to stop at once");
-            }
-        });
-    });
-}
-
 /// Runs the command.
 pub fn run(args: &TrainArgs) -> Result<(), Failure> {
     if args.data.split == SplitArg::Test {
@@ -216,10 +198,13 @@ pub fn run(args: &TrainArgs) -> Result<(), Failure> {
     let _held = hold(&out)?;
     // Another run may have ended since.
     check_unused(&out, args.resume)?;
-    stop_on_ctrl_c();
+    // A checkpoint after the step in work, or before the first step an end after what is in work.
+    note_ctrl_c(
+        "stopping after this step; Ctrl-C again to stop at once",
+        "stopped at once: what was done since the last checkpoint is lost",
+    );
     let console = Console::default();
-    let bundle =
-        train(&drives.root, &drives.drives, &hash, &recipe, Some(baselines.to_json()), &console, &|| INTERRUPTED.load(Ordering::SeqCst));
+    let bundle = train(&drives.root, &drives.drives, &hash, &recipe, Some(baselines.to_json()), &console, &is_noted);
     let bundle = match bundle {
         Err(error @ (TrainingError::Drives(_) | TrainingError::Foreign { .. })) => return Err(Failure::input(error.to_string())),
         other => other.or_failed()?,

@@ -11,6 +11,7 @@ use tokio::runtime::Runtime;
 use super::Task;
 use super::stage::Stage;
 use crate::failure::Failure;
+use crate::interrupt;
 use crate::output::{self, note};
 use crate::progress::Progress;
 
@@ -19,6 +20,8 @@ const VELOCITY_MISMATCH_MAX_M_S: f64 = 0.5;
 
 /// Positions that move more than this share further or less far than velocities say are those of a step that takes another time.
 const STEP_OFF_MAX: f64 = 0.05;
+/// Mean distance between measured and true positions from which on they are of two points or frames, m: noise is a few centimetres.
+const TRUTH_OFF_MAX_M: f64 = 0.3;
 /// A vehicle whose yaw rate correlates with the command by less turns the other way.
 const TURN_CORRELATION_MIN: f64 = -0.5;
 
@@ -96,12 +99,26 @@ impl Kept {
     }
 }
 
-/// Drives the laps that are not in files yet. Gives the laps there are, in the order of the tasks, and why there are no more where one failed.
-pub fn drive_all(stage: &mut Stage<'_>, runtime: &Runtime, tasks: &[Task], kept: &Kept) -> (Vec<Run>, Result<(), Failure>) {
+/// The laps there are, what is doubtful about them, and why there are no more.
+pub struct Driven {
+    /// Laps in the order of the tasks.
+    pub runs: Vec<Run>,
+    /// A sentence each.
+    pub warnings: Vec<String>,
+    /// What ended the command early.
+    pub ended: Result<(), Failure>,
+}
+
+/// Drives the laps that are not in files yet.
+pub fn drive_all(stage: &mut Stage<'_>, runtime: &Runtime, tasks: &[Task], kept: &Kept) -> Driven {
     let progress = Progress::start("laps", tasks.len());
-    let mut notes = Notes { of_another: kept.plant != Identity::BuiltIn, no_truth: false, velocity: false, turning: false };
+    let mut notes = Notes { of_another: kept.plant != Identity::BuiltIn, ..Notes::default() };
     let (mut runs, mut taken, mut ended) = (Vec::new(), 0, Ok(()));
     for task in tasks {
+        if interrupt::is_noted() {
+            ended = Err(kept.to_go_on(Failure::Failed("interrupted".into()), runs.len()));
+            break;
+        }
         let run = match kept.earlier(task) {
             Some(run) => {
                 taken += 1;
@@ -127,15 +144,18 @@ pub fn drive_all(stage: &mut Stage<'_>, runtime: &Runtime, tasks: &[Task], kept:
     if taken > 0 {
         note!("{taken} laps taken from {}", kept.out.display());
     }
-    (runs, ended)
+    Driven { runs, warnings: notes.warnings, ended }
 }
 
 /// What is to be said once of laps on another simulator.
+#[derive(Default)]
 struct Notes {
     of_another: bool,
     no_truth: bool,
+    truth: bool,
     velocity: bool,
     turning: bool,
+    warnings: Vec<String>,
 }
 
 impl Notes {
@@ -143,21 +163,35 @@ impl Notes {
         if !self.of_another {
             return;
         }
-        if run.lap.scored == Scored::State && !self.no_truth {
+        let lap = &run.lap;
+        if lap.scored == Scored::State && !self.no_truth {
             self.no_truth = true;
-            note!("note: the plant tells no `truth`: laps are scored by `state`, with its noise");
+            self.say("note: the plant tells no `truth`: laps are scored by `state`, with its noise".into());
         }
-        if let Some(doubt) = doubt_of_velocities(&run.lap).filter(|_| !self.velocity) {
+        if let Some(off_m) = lap.measured_off_m.filter(|off_m| *off_m > TRUTH_OFF_MAX_M && !self.truth) {
+            self.truth = true;
+            self.say(format!(
+                "warning: {}: positions of `truth` are {off_m:.2} m from those of `state` in the mean: laps are scored by `truth`; are both of the reference point?",
+                task.file_name()
+            ));
+        }
+        if let Some(doubt) = doubt_of_velocities(lap).filter(|_| !self.velocity) {
             self.velocity = true;
-            note!("warning: {}: {doubt}", task.file_name());
+            self.say(format!("warning: {}: {doubt}", task.file_name()));
         }
-        if run.lap.turn_correlation.is_some_and(|correlation| correlation < TURN_CORRELATION_MIN) && !self.turning {
+        if lap.turn_correlation.is_some_and(|correlation| correlation < TURN_CORRELATION_MIN) && !self.turning {
             self.turning = true;
-            note!(
+            self.say(format!(
                 "warning: {}: the vehicle turns right where it is told to turn left: a positive `second` is to the left, and so is a positive yaw rate",
                 task.file_name()
-            );
+            ));
         }
+    }
+
+    /// Says it now, and in the report.
+    fn say(&mut self, warning: String) {
+        note!("{warning}");
+        self.warnings.push(warning);
     }
 }
 

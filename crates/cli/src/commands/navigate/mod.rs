@@ -20,17 +20,19 @@ use serde_json::{Value, json};
 
 use crate::args::{BundleArgs, DataArgs};
 use crate::failure::{Failure, OrFail};
-use crate::interrupt::exit_on_ctrl_c;
+use crate::interrupt::note_ctrl_c;
 use crate::output::{self, say};
 use crate::sources::{check_model_step, load_bundle_for, on_vehicle_of, open_root};
 
-use laps::{Identity, Kept, drive_all};
+use laps::{Driven, Identity, Kept, drive_all};
 use stage::{Bundles, Stage, kinematic_of};
 
 /// Correlation of the planner's noise from step to step, its standard deviation (m/s; share of full steering) and the temperature of its weights.
 const NOISE_CORRELATION: f64 = 0.8;
 const NOISE_SD: [f64; 2] = [0.4, 0.16];
 const TEMPERATURE: f64 = 0.1;
+/// Radius of the turn at the wanted speed that counts as full steering for a vehicle that is told its yaw rate, m.
+const SHARPEST_TURN_M: f64 = 2.5;
 /// Admitted speed commands: what the training drives cover, m/s.
 const SPEED_LIMITS_M_S: [f64; 2] = [0.5, 4.0];
 /// Weights of progress and tilt against the squared distance from the path.
@@ -53,6 +55,8 @@ const CAUTION: CautionSettings = CautionSettings {
 const SCENARIO: [&str; 5] = ["w35", "w36", "w37", "w38", "w39"];
 /// Files that tell the true soil of a world.
 const TRUE_SOIL: [&str; 2] = ["gt_soil.json", "gt_region.png"];
+/// Largest seed.
+const SEED_MAX: u64 = 1 << 53;
 /// Steps of a candidate at most: one of the 32 positions of the model is the step whose command is already on its way.
 const HORIZON_MAX: usize = 31;
 
@@ -173,12 +177,10 @@ impl Task {
 pub fn run(args: &NavigateArgs) -> Result<(), Failure> {
     check(args)?;
     output::check_files(args.json.iter().chain(&args.html))?;
-    exit_on_ctrl_c(match args.plant {
-        None => "laps that were driven to their end are kept, and the same command goes on after them",
-        Some(_) => {
-            "laps that were driven to their end are kept, and the same command goes on after them, with --resume if the plant does not say which it is"
-        }
-    });
+    note_ctrl_c(
+        "stopping: the laps that are done are kept and reported; Ctrl-C again to stop at once",
+        "stopped at once: the laps that are done are kept",
+    );
     let effects = HiddenEffects::parse(args.effect.iter().map(String::as_str)).or_input()?;
     let data = DataArgs::of(args.data.clone());
     let (root, path) = open_root(&data)?;
@@ -209,14 +211,22 @@ pub fn run(args: &NavigateArgs) -> Result<(), Failure> {
     provenance.push(("plant".to_string(), plant_text(args, &plant)));
     of_worlds.values_mut().chain([&mut settings]).for_each(|settings| settings["plant"] = plant.in_settings());
     let kept = Kept { out: out.clone(), settings: of_worlds, plant, resume: args.resume };
-    let (runs, ended) = drive_all(&mut stage, &runtime, &tasks, &kept);
+    let Driven { runs, mut warnings, ended } = drive_all(&mut stage, &runtime, &tasks, &kept);
     if ended.is_ok() {
         runtime.block_on(stage.stop());
     } else {
         provenance.push(("ended early".to_string(), format!("{} of {} laps", runs.len(), tasks.len())));
     }
-    let reported = if runs.is_empty() { Ok(()) } else { report(args, NavigationReport { runs, settings, folder: out, provenance }) };
-    ended.and(reported)
+    if runs.is_empty() {
+        return ended;
+    }
+    for name in nesam_navigation::lost(&runs) {
+        let warning =
+            format!("warning: every lap of {name} is lost: a number of `state` or `truth` is none, or beyond what a vehicle does");
+        output::note!("{warning}");
+        warnings.push(warning);
+    }
+    ended.and(report(args, &NavigationReport { runs, settings, folder: out, warnings, provenance }))
 }
 
 /// The plant as it is told of in reports.
@@ -245,6 +255,10 @@ fn check(args: &NavigateArgs) -> Result<(), Failure> {
     };
     twice("--worlds", args.worlds.as_deref().unwrap_or_default())?;
     twice("--configurations", &args.configurations.iter().flatten().map(|c| c.as_str().to_string()).collect::<Vec<_>>())?;
+    // Plants written in other languages count to 2^53.
+    if args.seed.saturating_add(args.runs as u64) > SEED_MAX {
+        return Err(Failure::input(format!("--seed {} and the seeds after it are not below 2^53", args.seed)));
+    }
     if args.plant_timeout == Some(0) {
         return Err(Failure::input("--plant-timeout 0 leaves no time to answer; give a second or more"));
     }
@@ -369,13 +383,14 @@ fn tasks_of(args: &NavigateArgs, worlds: &[(String, SoilKind)], configurations: 
 
 fn settings_of(args: &NavigateArgs, bundle: &ModelBundle, diagnosed: Option<&ModelBundle>) -> Value {
     json!({
+        "version": env!("CARGO_PKG_VERSION"),
         "bundle_hash": bundle.hash,
         "diagnosed_hash": diagnosed.map(|bundle| &bundle.hash),
         "candidates": args.candidates,
         "horizon": args.horizon,
         "plan_every": args.plan_every,
         "cost": cost_of(args),
-        "noise_sd": NOISE_SD,
+        "noise_sd": mppi_of(args, &bundle.vehicle).noise_sd,
         "noise_correlation": NOISE_CORRELATION,
         "temperature": TEMPERATURE,
         "speed_limits_m_s": speed_limits_m_s(&bundle.vehicle),
@@ -405,7 +420,9 @@ fn caution_of(args: &NavigateArgs) -> Option<CautionSettings> {
 
 fn mppi_of(args: &NavigateArgs, vehicle: &Vehicle) -> MppiSettings {
     let [low, high] = vehicle.command_range[1];
-    let half = 0.5 * (high - low);
+    let range = 0.5 * (high - low);
+    // A base that can turn on the spot is not to try that at every step.
+    let half = if vehicle.second == SecondCommand::YawRateRadS { range.min(args.speed / SHARPEST_TURN_M) } else { range };
     MppiSettings {
         candidates: args.candidates,
         limits: [speed_limits_m_s(vehicle), [low, high]],
@@ -426,20 +443,15 @@ fn steering_guess(vehicle: &Vehicle, path: &ReferencePath, speed_m_s: f64) -> f6
     (full * 2.0 * angle / (left + right)).min(full)
 }
 
-fn report(args: &NavigateArgs, report: NavigationReport) -> Result<(), Failure> {
-    let widths = [8, 10, 5, 16, 13, 27, 13, 14, 13, 20, 20, 20];
-    let line = |cells: Vec<&str>| {
-        let padded = cells.iter().zip(widths).enumerate().map(|(i, (c, w))| if i < 2 { format!("{c:<w$}") } else { format!("{c:>w$}") });
-        say!("{}", padded.collect::<String>());
-    };
-    line(NavigationReport::HEAD.to_vec());
-    for row in report.rows() {
-        line(row.iter().map(String::as_str).collect());
+fn report(args: &NavigateArgs, report: &NavigationReport) -> Result<(), Failure> {
+    let rows: Vec<[String; 12]> = std::iter::once(NavigationReport::HEAD.map(String::from)).chain(report.rows()).collect();
+    let width = |column: usize| rows.iter().map(|row| row[column].chars().count()).max().unwrap_or(0);
+    let widths: [usize; 12] = std::array::from_fn(width);
+    for row in &rows {
+        let padded = row.iter().zip(widths).enumerate().map(|(i, (c, w))| if i < 2 { format!("{c:<w$}") } else { format!("{c:>w$}") });
+        say!("{}", padded.collect::<Vec<_>>().join("  "));
     }
     report.ends().iter().for_each(|ends| say!("not completed by {ends}"));
-    for name in report.lost() {
-        output::note!("warning: every lap of {name} is lost: a number of `state` or `truth` is none, or beyond what a vehicle does");
-    }
     if let Some(file) = &args.json {
         output::write_json(file, &report.to_json())?;
     }

@@ -10,10 +10,10 @@ use nesam_client::Client;
 use nesam_evaluation::{Baselines, Kinematic};
 use nesam_model::ModelBundle;
 use nesam_navigation::{
-    BuiltInPlant, Forecaster, KinematicForecaster, Lap, LapPlan, NavigationError, PlantLink, ReferencePath, RemotePlant, Run,
-    ServedForecaster, SoilAhead, Surroundings, run_lap,
+    Answer, BuiltInPlant, Forecaster, KinematicForecaster, Lap, LapPlan, NavigationError, PlantLink, ReferencePath, RemotePlant, Run,
+    ServedForecaster, SoilAhead, Start, Surroundings, run_lap,
 };
-use nesam_physics::DT_S;
+use nesam_physics::{Control, DT_S};
 use nesam_plant::{Ground, HiddenEffects};
 use nesam_server::{Config, RunningServer};
 use nesam_trajectories::DataRoot;
@@ -23,6 +23,7 @@ use super::laps::Identity;
 use super::{Configuration, NavigateArgs, Task, caution_of, cost_of, mppi_of, steering_guess};
 use crate::commands::serve;
 use crate::failure::{Failure, OrFail};
+use crate::interrupt;
 
 /// What a buffer would have to add, as share of the prior information, for a filter that is not to learn: no buffer does.
 const NEVER_EXCITED: f64 = 1e12;
@@ -50,6 +51,23 @@ pub struct Bundles {
     pub diagnosed: Option<ModelBundle>,
 }
 
+/// A plant that is driven no further after Ctrl-C.
+struct Interruptible(Box<dyn PlantLink>);
+
+impl PlantLink for Interruptible {
+    fn reset(&mut self, start: &Start) -> Result<Answer, NavigationError> {
+        self.0.reset(start)
+    }
+
+    fn step(&mut self, command: Control<f64>) -> Result<Answer, NavigationError> {
+        if interrupt::is_noted() { Err(NavigationError::Interrupted) } else { self.0.step(command) }
+    }
+
+    fn name(&mut self, start: &Start) -> Result<Option<String>, NavigationError> {
+        self.0.name(start)
+    }
+}
+
 /// Which server a lap is predicted by.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
 enum Kind {
@@ -67,7 +85,7 @@ pub struct Stage<'a> {
     root: DataRoot,
     data: PathBuf,
     bundles: Bundles,
-    plant: Box<dyn PlantLink>,
+    plant: Interruptible,
     path: ReferencePath,
     services: BTreeMap<Kind, Service>,
     /// What the oracle is told, by world.
@@ -82,11 +100,12 @@ impl<'a> Stage<'a> {
             Some(address) => {
                 let timeout = Duration::from_secs(args.plant_timeout.unwrap_or(PLANT_TIMEOUT_S));
                 let plant = RemotePlant::connect(address, first_number(), timeout).or_input()?;
-                Box::new(plant.telling(|text| crate::output::note!("note: {text}")))
+                Box::new(plant.telling(|text| crate::output::note!("note: {text}")).until(interrupt::is_noted))
             }
             None => Box::new(BuiltInPlant::new(&data, effects).or_input()?),
         };
         let path = ReferencePath::of_ood_soil();
+        let plant = Interruptible(plant);
         Ok(Self { args, root, data, bundles, plant, path, services: BTreeMap::new(), told: Vec::new(), driven: 0 })
     }
 
@@ -122,7 +141,7 @@ impl<'a> Stage<'a> {
     /// Drives one lap; once again where the plant lost it on the way.
     pub async fn drive(&mut self, task: &Task) -> Result<Run, Failure> {
         let lap = match self.lap(task).await? {
-            Err(lost @ NavigationError::Lost { .. }) => {
+            Err(lost @ NavigationError::Lost { .. }) if !interrupt::is_noted() => {
                 crate::output::note!("note: {}: {lost}; it is driven once again", task.file_name());
                 self.lap(task).await?
             }
@@ -135,7 +154,7 @@ impl<'a> Stage<'a> {
     /// One try of a lap, with a session of its own; what failed on the way is told apart from what failed before.
     async fn lap(&mut self, task: &Task) -> Result<Result<Lap, NavigationError>, Failure> {
         let mut model = self.model(task).await?;
-        let lap = run_lap(&self.plan_of(task), self.plant.as_mut(), &mut model).await;
+        let lap = run_lap(&self.plan_of(task), &mut self.plant, &mut model).await;
         if let Forecaster::Served(served) = model {
             let closed = served.close().await;
             // A lap that failed says more than the session that it leaves.
