@@ -179,9 +179,9 @@ fn tried(
         }
         let score = |learned: &[Learned]| score_held_out(predictor, drives, maps, learned, &options.scoring, work);
         let mut scores = if drives.is_empty() { None } else { Some(score(&learned)?) };
-        // What a sensor or the map is wrong by is no matter of the soil.
+        // What a sensor or the map is wrong by is no matter of the soil. Where no map tells the ground it was found before, and effects stand on it.
         let acting = judgement.claimed().into_iter().any(|i| acts(&judgement.findings[i]));
-        if !yardstick.model_on_trial && acting && scores.as_ref().is_some_and(ground_may_be_another) {
+        if case.bench.ground == SoilCorrection::NONE && acting && scores.as_ref().is_some_and(ground_may_be_another) {
             held.seek_ground(case, &mut learned, &mut taught);
             held.stand_on_ground(case, &mut learned, &mut taught);
             scores = Some(HeldOut { another_ground: true, ..score(&learned)? });
@@ -387,9 +387,11 @@ fn proven(
     let own: Vec<&Finding> = judgement.claimed().into_iter().map(|i| &judgement.findings[i]).collect();
     let claimed: Vec<&Finding> = told.findings.iter().chain(own.iter().copied()).collect();
     let (verdict, reason) = told.said_with(judgement);
-    let Some(first) = claimed.first() else { return (verdict, reason) };
-    let what = if told.is_empty() { first.candidate.label() } else { labels(&claimed) };
-    let refused = |why: String| (Verdict::Unexplained, format!("{what} fits, but {why}"));
+    if claimed.is_empty() {
+        return (verdict, reason);
+    }
+    let fits = if claimed.len() > 1 { "fit" } else { "fits" };
+    let refused = |why: String| (Verdict::Unexplained, format!("{} {fits}, but {why}", labels(&claimed)));
     let Some(scores) = scores else {
         let stands = !model_on_trial && beyond_doubt(&claimed, judgement.selection.threshold);
         return if stands { (verdict, reason) } else { refused("no drive is left to prove it on".into()) };
@@ -520,7 +522,9 @@ mod tests {
         assert_eq!(said(&[("steering_offset", 12.0), ("gyro_bias", 11.0)], false), explained);
         for claims in [&[("map_offset", 9.9)][..], &[("steering_offset", 12.0), ("tow", 12.0)], &[("gyro_bias", 12.0), ("tow", 9.0)]] {
             let (verdict, reason) = said(claims, false);
-            let why = format!("{} fits, but no drive is left to prove it on", claims[0].0);
+            let (names, fits) =
+                (claims.iter().map(|claim| claim.0).collect::<Vec<_>>().join(" with "), if claims.len() > 1 { "fit" } else { "fits" });
+            let why = format!("{names} {fits}, but no drive is left to prove it on");
             assert_eq!((verdict, reason), (Verdict::Unexplained, why));
         }
         assert_eq!(said(&[("steering_offset", 40.0)], true).0, Verdict::Unexplained);
