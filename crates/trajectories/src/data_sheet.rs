@@ -38,6 +38,8 @@ const STIFF_DAMPING_RATIO: f64 = 0.7;
 const CAR_SPEED_RANGE_M_S: [f64; 2] = [-2.0, 12.0];
 /// Largest rim speed of a skid-steer card that gives none, m/s.
 const SKID_RIM_LIMIT_M_S: f64 = 3.0;
+/// Two statements of one length may differ by this share: they are rounded.
+const SAME: f64 = 0.02;
 /// Width of a wheel whose card gives none, in radii.
 const WIDTH_SHARE: f64 = 0.6;
 /// Wheelbase of a card that gives none, in tracks: of a skid-steer base and of a car.
@@ -178,6 +180,12 @@ impl Wheels {
             }
             let track_m = round((apart(0, 1, 1) + apart(2, 3, 1)) / 2.0);
             let wheelbase_m = round((apart(0, 2, 0) + apart(1, 3, 0)) / 2.0);
+            let stated_m = sheet.positive(&["wheelbase_m", "wheelbase"])?.filter(|stated_m| (stated_m / wheelbase_m - 1.0).abs() > SAME);
+            if let Some(stated_m) = stated_m {
+                notes.push(format!(
+                    "vehicle card: a wheelbase of {stated_m} m is stated, and the wheel centres are {wheelbase_m} m apart, which counts"
+                ));
+            }
             return Ok(Self { centre_m, radius_m, width_m, track_m, wheelbase_m });
         }
         let front = sheet.required(&["track_m", "track_front", "track_front_m"])?;

@@ -279,10 +279,13 @@ fn summary(scored: &[Scored], changes: &BTreeMap<String, [Value; 2]>, held_out: 
         }
     }
     if let Some(turning) = after.turning().filter(|turning| (turning - 1.0).abs() > TURNING_OFF) {
-        say!(
-            "  warning: with the fitted card the physics turns {turning:.2} times as much as the vehicle: no number that is fitted makes up for that. See track, \
-             wheelbase, wheels and centre of gravity of the card; a base on casters, or one that rolls on more than four wheels, is not what the physics can be"
-        );
+        let why = if turning < 0.0 {
+            "the second command or the yaw has the opposite sign: left is positive, `nesam check` says which"
+        } else {
+            "no number that is fitted makes up for that. See track, wheelbase, wheels and centre of gravity of the card; a base on casters, or one that rolls on more than \
+             four wheels, is not what the physics can be"
+        };
+        say!("  warning: with the fitted card the physics turns {turning:.2} times as much as the vehicle: {why}");
     }
     say!("\ncard -> fitted:");
     let shown = |value: &Value| if value.is_null() { "–".into() } else { value.to_string() };

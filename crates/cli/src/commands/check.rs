@@ -18,6 +18,8 @@ use crate::sources::{beyond_range_note, query};
 
 /// Coordinates beyond this are doubted, m: single precision has steps of 8 mm there (chosen).
 const FAR_M: f64 = 1e5;
+/// Steps of a second: shorter drives hold no prediction that says something (`nesam import` leaves them out).
+const PREDICTED_MIN: usize = 10;
 
 /// Options of `nesam check`.
 #[derive(Args, Debug)]
@@ -181,6 +183,15 @@ fn check_set(root: &DataRoot, set: &str, findings: &mut Findings) {
         Ok(recorded) => recorded,
         Err(e) => return findings.error(format!("set {set}: {}", chain(&e))),
     };
+    let short: Vec<&str> = drives.iter().filter(|d| d.states.len() <= PREDICTED_MIN).map(|d| d.id.as_str()).collect();
+    if let Some(first) = short.first() {
+        let what = format!(
+            "{} of {} drives, as `{first}`, are shorter than a second: nothing can be predicted in them",
+            short.len(),
+            drives.len()
+        );
+        findings.doubts.push(format!("set {set}: {what}; leave them out, or join them where they are parts of one drive"));
+    }
     let positions = drives.iter().flat_map(|d| &d.states).map(|s| s.position_m);
     let all = recorded_doubts(&recorded).into_iter().chain(doubts(&drives, root.vehicle())).chain(far_from_origin(positions));
     all.for_each(|doubt| findings.doubt(&format!("set {set}"), &doubt));

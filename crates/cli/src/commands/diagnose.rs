@@ -11,8 +11,8 @@ use clap::Args;
 use nesam_discovery::observe::channels::{self, CHANNELS};
 use nesam_discovery::report::{Report, describe};
 use nesam_discovery::{
-    Against, Bench, Diagnosis, Judge, Options, Reference, ReferenceDrives, SEGMENT_STEPS, Scoring, Segmented, catalogue, diagnose,
-    observe_all,
+    Against, Bench, DRIVES_MIN, Diagnosis, Judge, Options, Reference, ReferenceDrives, SEGMENT_STEPS, Scoring, Segmented, catalogue,
+    diagnose, observe_all,
 };
 use nesam_evaluation::report::Short;
 use nesam_evaluation::{DEFAULT_RESAMPLES, POSE_DIM, Provenance as ReportProvenance};
@@ -157,6 +157,15 @@ fn make_reference(args: &DiagnoseArgs) -> Result<(), Failure> {
     let hypotheses = hypotheses::read(args.hypotheses.as_deref())?;
     let dir = bundle_dir(args.bundle.bundle.as_deref())?;
     let drives = validation_drives(&args.data, "--make-reference", "the reference is measured")?;
+    let left = drives.drives.len();
+    if left < DRIVES_MIN {
+        return Err(Failure::input(format!(
+            "--make-reference: training left {left} drives for validation, every tenth of set `{}`, and a reference takes {DRIVES_MIN}, so about {} drives in the train \
+             split. Without one `nesam diagnose` tests the model itself (--reference physics)",
+            drives.set,
+            10 * DRIVES_MIN
+        )));
+    }
     let mut bundle = load_bundle(Some(&dir))?;
     check_own_vehicle(&bundle, &drives.root, "--make-reference")?;
     take_coupling(&mut bundle, drives.root.vehicle());

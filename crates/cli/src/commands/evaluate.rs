@@ -1,5 +1,6 @@
 //! `nesam evaluate`: errors of the models on recorded drives.
 
+use std::collections::BTreeSet;
 use std::path::PathBuf;
 use std::sync::Arc;
 
@@ -139,7 +140,7 @@ pub fn run(args: &EvaluateArgs) -> Result<(), Failure> {
         history_steps: args.window.history,
         dt_s: args.data.dt,
         windows: windows.len(),
-        trajectories: drives.drives.len(),
+        trajectories: windows.iter().map(|window| window.drive).collect::<BTreeSet<_>>().len(),
         path_m_median: path_median_m(&windows, truth),
         truth,
         inputs: Inputs::from(args.inputs).as_str(),
@@ -237,7 +238,8 @@ impl Models {
             true => kinematic(args, predictor.as_deref(), drives, training, horizon)?,
             false => None,
         };
-        let vehicle = Arc::new(drives.root.vehicle().clone());
+        // One card for all models: the bundle's where there is one, which is said to count.
+        let vehicle = Arc::new(predictor.as_ref().map_or_else(|| drives.root.vehicle(), |predictor| &predictor.bundle().vehicle).clone());
         let trained = trained_baselines(args, names, drives)?;
         let mut ready = Vec::new();
         let own_bundle = |name: ModelName| {
