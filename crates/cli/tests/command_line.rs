@@ -366,7 +366,7 @@ fn chrono_a_run_starts_from_a_bundle_and_from_none_of_another_form() {
     let root = sample().display().to_string();
     copy_folder(tiny_bundle(), &here.path().join("start"));
     let tiny = ["--epochs", "1", "--batches", "2", "--batch-size", "4", "--from", "start", "--out", "made"];
-    let run = |more: &'static [&'static str]| [&["train", "--data", root.as_str(), "--set", "nominal"], &tiny[..], more].concat();
+    let run = |more: &[&'static str]| [&["train", "--data", root.as_str(), "--set", "nominal"], &tiny[..], more].concat();
     let trained = nesam(&run(&["--sustained=0.2", "--soil-prior=0.05"]), here.path());
     assert_eq!(trained.status.code(), Some(0), "{}", stderr(&trained));
     let text = |bundle: &str, file: &str| std::fs::read_to_string(here.path().join(bundle).join(file)).unwrap();
@@ -380,6 +380,14 @@ fn chrono_a_run_starts_from_a_bundle_and_from_none_of_another_form() {
     assert!((limit("made/bundle") / limit("start") - 1.0).abs() < 1e-14);
     let manifest = text("made/bundle", "manifest.toml");
     assert!(manifest.contains("nesam train --data … --set nominal --epochs 1") && manifest.contains("--from … --out …"), "{manifest}");
+    // The same again, elsewhere and in two goes, is the same bundle to the byte.
+    let elsewhere = tempfile::tempdir().unwrap();
+    copy_folder(tiny_bundle(), &elsewhere.path().join("start"));
+    for more in [&["--sustained=0.2", "--soil-prior=0.05"][..], &["--sustained=0.2", "--soil-prior=0.05", "--resume"]] {
+        let again = nesam(&run(more), elsewhere.path());
+        assert_eq!(again.status.code(), Some(0), "{}", stderr(&again));
+        assert_eq!(std::fs::read_to_string(elsewhere.path().join("made/bundle/manifest.toml")).unwrap(), manifest);
+    }
     let inspected = nesam(&["inspect", "start"], here.path());
     let parent = manifest.lines().find_map(|line| line.strip_prefix("parent = \"")).unwrap();
     assert!(stdout(&inspected).contains(&parent[..12]), "{parent} is not in {}", stdout(&inspected));

@@ -145,6 +145,7 @@ pub fn run(
         |step, loss, norm| reporter.progress(step, &format!("loss {loss:.3}, gradient {norm:.2}")),
         |line| reporter.line(&describe(line, validating > 0)),
     )?;
+    reporter.line(&format!("{} steps in {:.0} s", trained.steps, optimisation_s(&trained.curve)));
     let curve = serde_json::to_string_pretty(&trained.curve).expect("numbers serialise; this is a bug");
     write(&recipe.out.join("loss_curve.json"), curve.as_bytes())?;
     let mut bundle = ModelBundle {
@@ -166,7 +167,7 @@ pub fn run(
             seed: plan.seed,
             data_hash: data_hash.into(),
             steps: trained.steps as u64,
-            training_s: optimisation_s(&trained.curve),
+            training_s: None,
             program: format!("nesam {}", env!("CARGO_PKG_VERSION")),
             parent: recipe.start.as_ref().map(|bundle| bundle.hash.clone()),
         },

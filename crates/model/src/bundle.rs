@@ -44,8 +44,9 @@ pub struct Provenance {
     pub data_hash: String,
     /// Optimiser steps.
     pub steps: u64,
-    /// Time that the optimiser took over all resumed runs, s.
-    pub training_s: f64,
+    /// Time that the optimiser took over all resumed runs, s: of bundles of earlier versions, as no two trainings take the same and are the same bundle all the same.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub training_s: Option<f64>,
     /// Version of the program.
     pub program: String,
     /// Hash of the bundle this one was derived from.

@@ -193,7 +193,8 @@ pub fn run(args: &TrainArgs) -> Result<(), Failure> {
         smooth_borders: args.borders.as_ref().map(|borders| borders == "smooth"),
         out: out.clone(),
         resume: args.resume,
-        command: command_without_paths(),
+        // However often it was interrupted, it is the same bundle.
+        command: command_without_paths().replace(" --resume", ""),
     };
     let _held = hold(&out)?;
     // Another run may have ended since.
