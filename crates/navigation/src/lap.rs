@@ -304,7 +304,6 @@ struct Track {
     whole: Vec<[f64; 2]>,
     scored: Scored,
     measured_off_sum_m: f64,
-    readings: usize,
     velocity: VelocityCheck,
     turns: TurnCheck,
     /// How the lap ended before its time: the vehicle or its simulation is beyond driving.
@@ -325,7 +324,6 @@ impl Track {
             whole: plan.path.points_between(0.0, std::f64::consts::TAU, REFERENCE_STEP_M),
             scored: Scored::Truth,
             measured_off_sum_m: 0.0,
-            readings: 0,
             velocity: VelocityCheck::default(),
             turns: TurnCheck::default(),
             ended: None,
@@ -345,7 +343,6 @@ impl Track {
             None => self.scored = Scored::State,
             Some(truth) => self.measured_off_sum_m += (reading.measured[0] - truth[0]).hypot(reading.measured[1] - truth[1]),
         }
-        self.readings += 1;
         self.velocity.add(&reading.measured);
     }
 
@@ -403,7 +400,7 @@ impl Track {
             velocity_mismatch_m_s: self.velocity.mismatch_m_s(),
             moved_over_told: self.velocity.moved_over_told(),
             turn_correlation: self.turns.correlation(),
-            measured_off_m: (self.scored == Scored::Truth && self.readings > 0).then(|| self.measured_off_sum_m / self.readings as f64),
+            measured_off_m: (self.scored == Scored::Truth).then(|| self.measured_off_sum_m / self.positions.len() as f64),
             path: self.positions.clone(),
             lean: self.lean.clone(),
         };

@@ -175,8 +175,7 @@ impl RemotePlant {
             told => Some(twelve(told).ok_or_else(not_true)?),
         };
         // Where the vehicle itself is lost its truth may be, too.
-        let finite = |state: &[f64; 12]| state.iter().all(|v| v.is_finite());
-        if finite(&measured) && truth.as_ref().is_some_and(|state| !finite(state)) {
+        if is_finite(&measured) && truth.as_ref().is_some_and(|state| !is_finite(state)) {
             return Err(not_true());
         }
         Ok(Answer::Reading(Reading { measured, truth }))
@@ -192,7 +191,7 @@ impl RemotePlant {
     }
 
     fn check_placed(&self, start: &Start, name: &str, state: &[f64; 12]) -> Result<(), NavigationError> {
-        if !state.iter().all(|v| v.is_finite()) {
+        if !is_finite(state) {
             return Ok(());
         }
         let [x_m, y_m] = start.position_m;
@@ -249,8 +248,7 @@ impl PlantLink for RemotePlant {
             _ => {
                 let answer = self.answer(&reply)?;
                 // A lap is scored by one of the two; where a number is none it is over.
-                let mixed =
-                    |reading: Reading| reading.truth.is_some() != self.tells_truth && reading.measured.iter().all(|v| v.is_finite());
+                let mixed = |reading: Reading| reading.truth.is_some() != self.tells_truth && is_finite(&reading.measured);
                 if answer.reading().is_some_and(mixed) {
                     return Err(self.wrong("`truth` is told in some answers and not in others: tell it in all since `reset`, or in none"));
                 }
@@ -264,6 +262,11 @@ impl PlantLink for RemotePlant {
         self.prepared = Some((start.clone(), answer));
         Ok(self.name.clone())
     }
+}
+
+/// Whether all numbers of a state are some.
+fn is_finite(state: &[f64; 12]) -> bool {
+    state.iter().all(|v| v.is_finite())
 }
 
 /// A text of a plant on one line, with what does not print as it is written in programs.

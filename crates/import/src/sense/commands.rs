@@ -1,10 +1,10 @@
 //! Whether the vehicle does what is commanded.
 
 use nesam_physics::{SecondCommand, Vehicle};
-use nesam_trajectories::{Trajectory, VelocitySource};
+use nesam_trajectories::Trajectory;
 
 use super::relation::{ANGLES, COMMANDED_SPEEDS, Relation};
-use super::{Doubt, SPEED_M_S, YAW_RATE_RAD_S, forward_m_s};
+use super::{Doubt, SPEED_M_S, YAW_RATE_RAD_S, forward_m_s, measures_velocity};
 
 /// Slopes between a command and what came of it that are let pass: a vehicle lags and slips.
 const FOLLOWS: [f64; 2] = [0.5, 1.6];
@@ -16,7 +16,7 @@ pub(super) const ANGLE_RAD: f64 = 0.05;
 pub(super) fn speed(drives: &[Trajectory], heading_holds: bool) -> Option<Doubt> {
     let pairs = Relation::of(drives, SPEED_M_S, |drive, k, world| {
         let state = &drive.states[k];
-        let estimated = drive.measured.velocity_source == VelocitySource::Positions;
+        let estimated = !measures_velocity(drive);
         let forward_m_s = if estimated { forward_m_s(drive, k, world) } else { state.velocity_m_s[0] };
         (heading_holds || !estimated).then_some([drive.controls[k].speed_m_s, forward_m_s])
     });

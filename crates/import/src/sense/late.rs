@@ -1,9 +1,9 @@
 //! Whether channels have one clock: which of two that tell the same, or of which one causes the other, is late.
 
 use nesam_physics::Vehicle;
-use nesam_trajectories::{Trajectory, VelocitySource};
+use nesam_trajectories::Trajectory;
 
-use super::{Doubt, angle_rate_rad_s, doubt, forward_m_s, ground_velocity_m_s, rim_speed_m_s};
+use super::{Doubt, angle_rate_rad_s, doubt, forward_m_s, ground_velocity_m_s, measures_velocity, rim_speed_m_s};
 
 /// How late is tried, steps.
 const STEPS_MAX: usize = 20;
@@ -26,9 +26,8 @@ struct Pair<'a> {
 /// What comes too late or too early.
 pub(super) fn late(drives: &[Trajectory], vehicle: &Vehicle) -> Vec<Doubt> {
     let ground = |drive: &Trajectory, k: usize| forward_m_s(drive, k, ground_velocity_m_s(drive, k));
-    let told = |drive: &Trajectory, k: usize| match drive.measured.velocity_source {
-        VelocitySource::Positions => rim_speed_m_s(drive, vehicle, k),
-        _ => Some(drive.states[k].velocity_m_s[0]),
+    let told = |drive: &Trajectory, k: usize| {
+        if measures_velocity(drive) { Some(drive.states[k].velocity_m_s[0]) } else { rim_speed_m_s(drive, vehicle, k) }
     };
     let gyro = |drive: &Trajectory, k: usize| drive.measured.angular_velocity[2].then(|| drive.states[k].angular_velocity_rad_s[2]);
     // A vehicle may take its time, and does nothing before it is told to.
@@ -64,14 +63,13 @@ pub(super) fn late(drives: &[Trajectory], vehicle: &Vehicle) -> Vec<Doubt> {
 
 impl Pair<'_> {
     fn judge(&self, drives: &[Trajectory]) -> Option<Doubt> {
-        let runs: Vec<(f64, Vec<[f64; 2]>)> = drives.iter().filter_map(|drive| Some((drive.dt_s, self.run(drive)?))).collect();
-        let step_s = runs.first()?.0;
-        if runs.iter().map(|(_, run)| run.len() - 2 * STEPS_MAX).sum::<usize>() < SAMPLES_MIN[1] {
+        let runs: Vec<Vec<[f64; 2]>> = drives.iter().filter_map(|drive| self.run(drive)).collect();
+        if runs.iter().map(|run| run.len() - 2 * STEPS_MAX).sum::<usize>() < SAMPLES_MIN[1] {
             return None;
         }
         let shifts = || -(STEPS_MAX as isize)..=STEPS_MAX as isize;
         let (best, by) = shifts().map(|by| (correlation(&runs, by), by)).max_by(|a, b| a.0.total_cmp(&b.0))?;
-        let late_s = by as f64 * step_s;
+        let late_s = by as f64 * drives.first()?.dt_s;
         // At an end of what is tried it may be any.
         let is_told = by.unsigned_abs() < STEPS_MAX;
         let is_sound = (self.sound_s[0]..=self.sound_s[1]).contains(&late_s);
@@ -96,9 +94,9 @@ impl Pair<'_> {
 }
 
 /// Correlation of the first with the second so many steps later, about their means in each drive; the first are the same ones whatever the shift.
-fn correlation(runs: &[(f64, Vec<[f64; 2]>)], by: isize) -> f64 {
+fn correlation(runs: &[Vec<[f64; 2]>], by: isize) -> f64 {
     let [mut xy, mut xx, mut yy] = [0.0; 3];
-    for (_, run) in runs {
+    for run in runs {
         let firsts = STEPS_MAX..run.len() - STEPS_MAX;
         let pairs: Vec<[f64; 2]> = firsts.map(|k| [run[k][0], run[k.wrapping_add_signed(by)][1]]).collect();
         let mean = [0, 1].map(|i| pairs.iter().map(|pair| pair[i]).sum::<f64>() / pairs.len() as f64);

@@ -23,7 +23,7 @@ mod wheels;
 use std::ops::Range;
 
 use nesam_physics::{Vehicle, WHEELS, wrap_angle};
-use nesam_trajectories::Trajectory;
+use nesam_trajectories::{Trajectory, VelocitySource};
 
 pub use card::card_doubts;
 pub use recorded::recorded_doubts;
@@ -115,6 +115,11 @@ fn forward_m_s(drive: &Trajectory, k: usize, [x, y, _]: [f64; 3]) -> f64 {
 /// Rate of roll, pitch or yaw from the attitudes around a sample, rad/s.
 fn angle_rate_rad_s(drive: &Trajectory, k: usize, axis: usize) -> f64 {
     wrap_angle(drive.states[k + 1].attitude_rad[axis] - drive.states[k - 1].attitude_rad[axis]) / (2.0 * drive.dt_s)
+}
+
+/// Whether velocities are measured, and not what positions make of them.
+fn measures_velocity(drive: &Trajectory) -> bool {
+    drive.measured.velocity_source != VelocitySource::Positions
 }
 
 /// Mean rim speed, m/s.

@@ -1,9 +1,9 @@
 //! Whether velocities, rates and tilt fit poses.
 
-use nesam_trajectories::{Trajectory, VelocitySource, to_body};
+use nesam_trajectories::{Trajectory, to_body};
 
 use super::relation::{ANGLES, Relation, SPEEDS, UNRELATED_ADVICE};
-use super::{Doubt, SPEED_M_S, YAW_RATE_RAD_S, angle_rate_rad_s, doubt, forward_m_s};
+use super::{Doubt, SPEED_M_S, YAW_RATE_RAD_S, angle_rate_rad_s, doubt, forward_m_s, measures_velocity};
 
 /// Slopes between two measurements of the same that are let pass.
 const SAME: [f64; 2] = [0.7, 1.4];
@@ -32,7 +32,7 @@ pub(super) fn tilt(drives: &[Trajectory]) -> Option<Doubt> {
 /// Forward velocities that are measured against positions; whether they vary with these is asked where the positions hold.
 pub(super) fn velocity(drives: &[Trajectory], positions_hold: bool) -> Option<Doubt> {
     let forward = Relation::of(drives, SPEED_M_S, |drive, k, world| {
-        is_measured(drive).then(|| [forward_m_s(drive, k, world), drive.states[k].velocity_m_s[0]])
+        measures_velocity(drive).then(|| [forward_m_s(drive, k, world), drive.states[k].velocity_m_s[0]])
     });
     forward.judge("forward velocity", "positions", SAME, "x of the body pointing to the rear", SPEEDS).or_else(|| {
         let correlation = forward.unrelated().filter(|_| positions_hold)?;
@@ -43,16 +43,11 @@ pub(super) fn velocity(drives: &[Trajectory], positions_hold: bool) -> Option<Do
 /// Sideways velocities against positions: they are small, and only their sign can be told.
 pub(super) fn sideways(drives: &[Trajectory]) -> Option<Doubt> {
     let left = Relation::of(drives, SIDEWAYS_M_S, |drive, k, world| {
-        is_measured(drive).then(|| [to_body(drive.states[k].attitude_rad, world)[1], drive.states[k].velocity_m_s[1]])
+        measures_velocity(drive).then(|| [to_body(drive.states[k].attitude_rad, world)[1], drive.states[k].velocity_m_s[1]])
     });
     let (count, of) = left.reversed(SIDEWAYS_M_S)?;
     let what = format!("sideways velocity has the opposite sign of what positions say in {count} of {of} seconds");
     Some(doubt(what, "y of the body must point to the left; import with `--frame ned-frd` or negate it"))
-}
-
-/// Whether velocities are not those that positions make.
-fn is_measured(drive: &Trajectory) -> bool {
-    drive.measured.velocity_source != VelocitySource::Positions
 }
 
 /// Measured rates against measured attitudes.

@@ -3,9 +3,9 @@
 use std::ops::Range;
 
 use nesam_physics::Vehicle;
-use nesam_trajectories::{Trajectory, VelocitySource};
+use nesam_trajectories::Trajectory;
 
-use super::{Doubt, doubt, rim_speed_m_s};
+use super::{Doubt, doubt, measures_velocity, rim_speed_m_s};
 
 /// Time, s, and way that is told meanwhile, m, from which on unchanged positions are doubted (chosen: the lidar poses of the Husky stay for 0.9 s and 0.9 m).
 const FROZEN: (f64, f64) = (1.5, 1.0);
@@ -34,7 +34,7 @@ fn stays(drive: &Trajectory) -> Vec<Range<usize>> {
 fn told_m_s(drive: &Trajectory, vehicle: &Vehicle, k: usize) -> Option<f64> {
     let [x, y, _] = drive.states[k].velocity_m_s;
     let rims = rim_speed_m_s(drive, vehicle, k).map(f64::abs);
-    if drive.measured.velocity_source == VelocitySource::Positions { rims } else { Some(x.hypot(y)) }
+    if measures_velocity(drive) { Some(x.hypot(y)) } else { rims }
 }
 
 /// Positions that stay while the vehicle is said to move.
