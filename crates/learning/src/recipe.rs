@@ -103,10 +103,6 @@ pub fn run(
     }
     let stages = Stages { recipe, reporter, interrupted };
     let (validation_at, mut train_at): (Vec<usize>, Vec<usize>) = (0..drives.len()).partition(|&i| is_validation(i, drives.len()));
-    if train_at.iter().all(|&i| drives[i].states.len() <= plan.horizon) {
-        // Before the encoders, which need no drive.
-        return Err(TrainingError::no_drive_longer_than(plan.horizon));
-    }
     let (vehicle, mut scales) = stages.card(root, trajectories, &at(&drives, &train_at))?;
     scales.smooth_semantics = recipe.smooth_borders.unwrap_or(scales.smooth_semantics);
 

@@ -152,12 +152,6 @@ pub enum TrainingError {
     Interrupted(usize),
 }
 
-impl TrainingError {
-    pub(crate) fn no_drive_longer_than(horizon: usize) -> Self {
-        Self::Drives(format!("no drive is longer than the horizon of {horizon} steps; use a shorter --horizon"))
-    }
-}
-
 impl From<candle_core::Error> for TrainingError {
     fn from(error: candle_core::Error) -> Self {
         Self::Model(ModelError::Tensor(error))
@@ -379,7 +373,10 @@ fn window_starts<'a>(set: &TrainingSet<'a>, plan: &TrainingPlan) -> std::result:
         starts.extend((first..n.saturating_sub(plan.horizon)).map(|start| (*drive, start)));
     }
     if starts.is_empty() {
-        return Err(TrainingError::no_drive_longer_than(plan.horizon));
+        return Err(TrainingError::Drives(format!(
+            "no drive is longer than the horizon of {} steps; use a shorter --horizon",
+            plan.horizon
+        )));
     }
     Ok(starts)
 }
