@@ -13,11 +13,6 @@ pub fn sample_root() -> PathBuf {
     repository().join("tests/data/chrono_sample")
 }
 
-/// The full data beside the repository, if it is there.
-pub fn full_data() -> Option<PathBuf> {
-    Some(repository().join("../shared/data")).filter(|path| path.join("chrono").is_dir())
-}
-
 /// The bundle that is shipped for the vehicle of the sample.
 pub fn shipped_bundle() -> PathBuf {
     repository().join("deploy/bundles/hmmwv-nominal")

@@ -10,7 +10,8 @@ use crate::conditions::conditions;
 use crate::joint::{JointState, Linearisation, correction_of};
 use crate::prediction::{BufferedTransition, VELOCITY_DIM, predict_along, velocities_along};
 use crate::trust::{NoiseScale, Trust};
-use crate::{AdaptationError, FilterConfig, Innovation, KalmanStep, chi_square_tail};
+use crate::update::KalmanStep;
+use crate::{AdaptationError, FilterConfig, Innovation, chi_square_tail};
 
 mod snapshot;
 

@@ -6,7 +6,8 @@ use nesam_physics::{SOIL_DIM, SoilCorrection};
 use crate::covariance::check_covariance;
 use crate::filter::JointSnapshot;
 use crate::noise::SharedError;
-use crate::{AdaptationError, FilterConfig, KalmanStep, kalman_update};
+use crate::update::{KalmanStep, kalman_update};
+use crate::{AdaptationError, FilterConfig};
 
 /// What the correlations of a filter's own covariance may be off by.
 const ROUNDING: f64 = 1e-9;

@@ -11,7 +11,7 @@
 //! | buffer 𝒟, Y | [`SoilFilter::push`] |
 //! | Ŷ and H by forward duals | [`predict_velocity`] |
 //! | R_B | [`BufferNoise`] |
-//! | S, K, Δθ⁺, P⁺ | [`kalman_update`] |
+//! | S, K, Δθ⁺, P⁺ | `kalman_update` in `update.rs` |
 #![forbid(unsafe_code)]
 
 mod agreement;
@@ -33,13 +33,12 @@ mod update;
 pub use agreement::Agreement;
 pub use calibration::{NoiseCalibration, UncorrectedBuffer, calibrate};
 pub use chi_square::chi_square_tail;
-pub use conditions::{CONDITIONS, NoiseConditions, conditions};
+pub use conditions::{NoiseConditions, conditions};
 pub use config::{FilterConfig, Innovation};
 pub use covariance::check_covariance;
 pub use error::AdaptationError;
 pub use filter::{ClassBelief, FilterSnapshot, JointSnapshot, SoilFilter, SoilPosterior, SoilUpdate, uncorrected};
-pub use forecast::{FORECAST_AHEAD, FORECAST_STEPS, FORECAST_VALUES, ForecastCheck, planar_mahalanobis};
+pub use forecast::{FORECAST_AHEAD, FORECAST_STEPS, ForecastCheck, planar_mahalanobis};
 pub use noise::{BufferNoise, ChannelNoise, SharedError, VelocityNoise};
 pub use prediction::{BufferedTransition, VELOCITY_DIM, VelocityPrediction, predict_velocity};
 pub use settings::{CalibratedFilter, Coordinates, FilterSettings};
-pub use update::{KalmanStep, kalman_update};

@@ -46,11 +46,10 @@ pub struct VelocityPrediction {
     pub jacobian: [[f64; SOIL_DIM]; VELOCITY_DIM],
 }
 
-/// ŷ_{k+1} = V(F(x_k, u_k, m_k; clip(θ̄_k ⊕ Δθ))) and its Jacobian, in one pass of the physics over dual numbers.
+/// ŷ_{k+1} = V(F(x_k, u_k, m_k; clip(θ̄_k ⊕ Δθ))) and its Jacobian, in one pass of the physics over dual numbers: what the filter takes a buffer of this one
+/// transition for.
 pub fn predict_velocity(model: &StepModel, transition: &BufferedTransition, correction: &SoilCorrection) -> VelocityPrediction {
-    let start = transition.input.state.to_array().map(SoilDual::constant);
-    let soil = corrected(transition, correction, &variables(correction));
-    prediction_of(&next_state(model, transition, &start, soil, made_up_for_m_s(model, transition, &soil)))
+    predict_along(model, core::slice::from_ref(transition), &|_| *correction, &|_| true)[0]
 }
 
 /// The same after every transition of a buffer, each starting where the prediction before it ended; only the first starts from a

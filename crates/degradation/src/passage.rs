@@ -197,7 +197,7 @@ impl Ride<'_> {
     /// The recorded commands at the middles of the steps from an instant on, row-major (steps, 2).
     fn commands(&self, from_s: f64, steps: usize) -> Vec<f32> {
         let at = |k: usize| self.drive.controls[place(self.drive, from_s + (k as f64 + 0.5) * self.drive.dt_s).0];
-        (0..steps).map(at).flat_map(|control| [control.speed_m_s as f32, control.second as f32]).collect()
+        (0..steps).map(at).flat_map(|control| control.packed()).collect()
     }
 
     fn true_pose(&self, time_s: f64) -> Pose {

@@ -8,6 +8,11 @@ pub trait Clock: Send + Sync {
     fn now_ns(&self) -> u64;
 }
 
+/// A time in seconds.
+pub(crate) fn seconds(ns: i64) -> f64 {
+    ns as f64 * 1e-9
+}
+
 /// A clock that stands until it is moved.
 #[derive(Debug, Default)]
 pub struct ManualClock(AtomicU64);

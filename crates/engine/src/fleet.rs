@@ -8,6 +8,8 @@ use nesam_fleet_soil::{
 };
 use nesam_terrain::WorldMap;
 
+use crate::clock::seconds;
+
 /// Half an edge of the square that colours are averaged over at most, cells of the world map.
 const COLOUR_HALF_MAX: f64 = 32.0;
 
@@ -55,13 +57,13 @@ impl Fleet {
     /// What a vehicle that begins here starts from; `None` without evidence.
     pub fn prior(&mut self, world: &WorldMap, position_m: [f64; 2], config: &FilterConfig, now_ns: u64) -> Option<FleetPrior> {
         let key = self.key(world, position_m);
-        self.map.prior(&key, position_m, &config.prior_sd, seconds(now_ns))
+        self.map.prior(&key, position_m, &config.prior_sd, seconds(now_ns as i64))
     }
 
     /// Adds what a session brought; gives all that is known of the cell that it changed, and what was brought here of it.
     pub fn add(&mut self, world: &WorldMap, brought: &Brought, now_ns: u64) -> Option<[FleetCell; 2]> {
         let key = self.key(world, brought.position_m);
-        self.map.add(key.clone(), &brought.increment, seconds(now_ns));
+        self.map.add(key.clone(), &brought.increment, seconds(now_ns as i64));
         let (all, own) = (self.map.cell(&key)?, *self.map.own_cell(&key)?);
         Some([all, own].map(|evidence| aged(&key, &evidence, now_ns)))
     }
@@ -87,9 +89,9 @@ impl Fleet {
         let cells = told.flat_map(|share| share.cells.iter().map(move |cell| (share.service.as_str(), cell)));
         cells
             .filter(|(service, cell)| {
-                let stamp_s = seconds(now_ns) - cell.age_s.max(0.0);
+                let stamp_s = seconds(now_ns as i64) - cell.age_s.max(0.0);
                 let evidence = CellEvidence::from_parts(&EvidenceParts { stamp_s, ..cell.evidence.parts() });
-                evidence.is_ok_and(|evidence| self.map.hear(service, cell.key.clone(), &evidence, seconds(now_ns)))
+                evidence.is_ok_and(|evidence| self.map.hear(service, cell.key.clone(), &evidence, seconds(now_ns as i64)))
             })
             .count()
     }
@@ -127,11 +129,7 @@ impl Fleet {
 
 /// A cell as the outside sees it.
 fn aged(key: &CellKey, evidence: &CellEvidence, now_ns: u64) -> FleetCell {
-    FleetCell { key: key.clone(), evidence: *evidence, age_s: seconds(now_ns) - evidence.stamp_s() }
-}
-
-fn seconds(now_ns: u64) -> f64 {
-    now_ns as f64 * 1e-9
+    FleetCell { key: key.clone(), evidence: *evidence, age_s: seconds(now_ns as i64) - evidence.stamp_s() }
 }
 
 #[cfg(test)]

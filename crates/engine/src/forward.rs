@@ -117,7 +117,7 @@ impl RollForward {
             let since = instant.sent.iter().filter(|sent| sent.stamp_ns > newest.stamp_ns);
             let in_effect = since.take_while(|sent| i128::from(sent.stamp_ns) <= middle_ns).last();
             let command = in_effect.map_or(newest.command, |sent| sent.command);
-            [command.speed_m_s as f32, command.second as f32]
+            command.packed()
         };
         Ok(Self { commands: (0..steps).map(command_in).collect(), back: 0 })
     }

@@ -46,12 +46,12 @@ pub use clock::{Clock, ManualClock};
 pub use command::{Command, Event, MeasureAnswer, OpenSession, Reply, SessionView, Snapshot};
 pub use engine::{Engine, EventSink};
 pub use error::EngineError;
-pub use extras::{CovarianceQuery, Covariances, ExtraOutputs, Jacobians, PredictExtras, SIGMA_POINTS, WhatIfSoils};
+pub use extras::{CovarianceQuery, Covariances, ExtraOutputs, Jacobians, PredictExtras, WhatIfSoils};
 pub use fleet::{FleetCell, FleetShare};
-pub use forward::{SENT_COMMANDS_MAX, SentCommand, StartInstant};
+pub use forward::{SentCommand, StartInstant};
 pub use grid::StepGrid;
 pub use handle::{Answer, EngineHandle, Executed, Submission, Tap, execute_guarded};
-pub use limits::{Limits, NAME_LENGTH_MAX, check_name};
+pub use limits::{Limits, check_name};
 pub use maps::MapRegistry;
 pub use measurement::{Measurement, Outcome, WheelMeasurement};
 pub use nesam_adaptation::{FORECAST_AHEAD, FilterSnapshot, ForecastCheck, JointSnapshot};
@@ -60,7 +60,7 @@ pub use query::{ALARM_ACTIVE, PredictQuery, Prediction, Provenance, SOIL_NOT_LEA
 pub use queue::DUE_AFTER;
 pub use ranking::{CostWeights, PathCost, Ranking};
 pub use session::{
-    Alarm, AlarmKind, AppliedEffect, AppliedEffects, AppliedParameter, BufferTest, Observed, OpenForecast, Session, SessionImage,
-    SoilEstimate, SoilState, TrackImage, UNCERTAIN_MAX, WatchImage,
+    Alarm, AlarmKind, AppliedEffect, AppliedEffects, AppliedParameter, BufferTest, OpenForecast, Session, SessionImage, SoilEstimate,
+    SoilState, TrackImage, UNCERTAIN_MAX, WatchImage,
 };
 pub use shown::Shown;

@@ -188,12 +188,12 @@ pub(crate) fn not_finite(state: &VehicleState<f64>) -> Option<&'static str> {
     state.to_array().iter().position(|v| !v.is_finite()).map(|i| STATE_FIELDS[i])
 }
 
-/// The entry of a command outside the card's range, with the reason. Compared in f32, so that the ends of the range are admitted in both precisions.
+/// The entry of a command outside the card's range, with the reason.
 pub(crate) fn outside_card(vehicle: &Vehicle, control: &Control<f64>) -> Option<(&'static str, String)> {
-    let entries = [("speed_m_s", control.speed_m_s, vehicle.command_range[0]), ("second", control.second, vehicle.command_range[1])];
-    entries.into_iter().find_map(|(name, value, [low, high])| {
-        let inside = value as f32 >= low as f32 && value as f32 <= high as f32;
-        (!inside).then(|| (name, format!("is {value}, the card of {} admits {low} to {high}", vehicle.name)))
+    let entries = [("speed_m_s", control.speed_m_s), ("second", control.second)];
+    entries.into_iter().enumerate().find(|(axis, (_, value))| !vehicle.admits_on(*axis, *value)).map(|(axis, (name, value))| {
+        let [low, high] = vehicle.command_range[axis];
+        (name, format!("is {value}, the card of {} admits {low} to {high}", vehicle.name))
     })
 }
 

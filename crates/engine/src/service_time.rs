@@ -1,7 +1,8 @@
 //! How long a prediction takes, learned from those before it.
 
+use crate::WhatIfSoils;
+use crate::extras::SIGMA_POINTS;
 use crate::query::PredictQuery;
-use crate::{SIGMA_POINTS, WhatIfSoils};
 
 /// Work of a prediction besides its steps, in sample-steps.
 const FIXED_WORK: f64 = 256.0;

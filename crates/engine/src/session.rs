@@ -30,6 +30,7 @@ pub use self::soil::{BufferTest, SoilState};
 use self::soil::{Judged, Learned, Models, SoilLearner};
 use self::track::{Stamped, Taken, Track};
 use self::watch::{Watch, WatchedBuffer};
+use crate::clock::seconds;
 use crate::error::EngineError;
 use crate::fleet::{Brought, Fleet};
 use crate::forward::Newest;
@@ -334,10 +335,10 @@ impl Session {
     fn learn_step(&mut self, newest: Stamped, models: Models<'_>, map: Option<&Arc<WorldMap>>) -> Option<f64> {
         self.settled.push(newest.1);
         let (_, before) = self.settled.history.make_contiguous().split_last()?;
-        let Judged { stamps_ns, learned, contradiction, standing } = self.learner.step(models, before, newest, map)?;
+        let Judged { stamps_ns, learned, contradiction, unseen, standing } = self.learner.step(models, before, newest, map)?;
         if let Some(watch) = self.watch.as_mut().filter(|_| !standing) {
             let agreement = learned.as_ref().map(|learned| &learned.update.agreement);
-            self.told.extend(watch.feed(WatchedBuffer::new(stamps_ns, agreement, contradiction)));
+            self.told.extend(watch.feed(WatchedBuffer::new(stamps_ns, agreement, contradiction, unseen)));
         }
         let Learned { update, brought } = learned?;
         self.fleet.brought.extend(brought.filter(|_| self.fleet.brings));
@@ -445,7 +446,7 @@ impl Session {
 
     /// Time since the session was fed or asked last, s.
     pub fn idle_s(&self, now_ns: u64) -> f64 {
-        now_ns.saturating_sub(self.used_ns) as f64 * 1e-9
+        seconds(now_ns.saturating_sub(self.used_ns) as i64)
     }
 
     /// Name of the session.
@@ -518,10 +519,6 @@ impl Session {
     pub fn age_s(&self, now_ns: u64) -> Option<f64> {
         self.newest().map(|_| seconds((now_ns as i64).saturating_sub(self.arrived_ns).max(0)))
     }
-}
-
-fn seconds(ns: i64) -> f64 {
-    ns as f64 * 1e-9
 }
 
 #[cfg(test)]

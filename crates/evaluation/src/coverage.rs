@@ -77,7 +77,7 @@ fn linearise(
     };
     let history = window.history();
     let future: &[Control<f64>] = &drive.controls[window.start..window.start + window.horizon];
-    let controls: Vec<f32> = future.iter().flat_map(|c| [c.speed_m_s as f32, c.second as f32]).collect();
+    let controls: Vec<f32> = future.iter().flat_map(Control::packed).collect();
     let query = RolloutQuery {
         history: &history,
         start: drive.states[window.start],

@@ -3,7 +3,7 @@
 use std::sync::Arc;
 
 use nesam_model::{HistoryStep, MeasuredWheels, Predictor, RolloutQuery, SoilField, Variant};
-use nesam_physics::{SoilCorrection, Vehicle};
+use nesam_physics::{Control, SoilCorrection, Vehicle};
 use nesam_terrain::WorldMap;
 
 use crate::adapt::DriveAdaptation;
@@ -195,7 +195,7 @@ pub fn roll_out_on(
     let drive = window.trajectory;
     let history = window.history();
     let future = &drive.controls[window.start..window.start + window.horizon];
-    let controls: Vec<f32> = future.iter().flat_map(|c| [c.speed_m_s as f32, c.second as f32]).collect();
+    let controls: Vec<f32> = future.iter().flat_map(Control::packed).collect();
     let query = RolloutQuery {
         history: &history,
         start: drive.states[window.start],

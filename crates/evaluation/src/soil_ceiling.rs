@@ -4,7 +4,7 @@ use std::sync::Arc;
 
 use nalgebra::{DMatrix, DVector};
 use nesam_model::{Predictor, RolloutQuery, SoilField, Variant};
-use nesam_physics::{SOIL_DIM, SoilCoordinates, SoilCorrection, wrap_angle};
+use nesam_physics::{Control, SOIL_DIM, SoilCoordinates, SoilCorrection, wrap_angle};
 use nesam_terrain::WorldMap;
 use rayon::prelude::*;
 
@@ -165,7 +165,7 @@ impl Fit<'_> {
     fn window_errors(&self, window: &Window<'_>, soils: &WhatIf) -> Result<Errors, EvaluationError> {
         let (drive, samples) = (window.trajectory, soils.0.len());
         let future = &drive.controls[window.start..window.start + window.horizon];
-        let one: Vec<f32> = future.iter().flat_map(|c| [c.speed_m_s as f32, c.second as f32]).collect();
+        let one: Vec<f32> = future.iter().flat_map(Control::packed).collect();
         let history = window.history();
         let query = RolloutQuery {
             history: &history,

@@ -18,11 +18,6 @@ pub struct Adam {
 }
 
 impl Adam {
-    /// Updates taken.
-    pub fn steps(&self) -> i32 {
-        self.steps
-    }
-
     /// One update with learning rate `rate`; gradients are scaled so that their joint norm is at most `norm_max`, and weight matrices shrink by the share
     /// `rate` · `decay` (Loshchilov & Hutter 2019). Returns the norm before scaling.
     ///

@@ -5,26 +5,26 @@
 //! measured poses are computed once ([`drives`]); and the network is trained through K-step rollouts ([`trainer`]).
 #![forbid(unsafe_code)]
 
-pub mod adam;
+mod adam;
 pub mod at_end;
-pub mod autoencoder;
+mod autoencoder;
 pub mod batch;
 pub mod calibrate;
 pub mod checkpoint;
-pub mod class_soil;
-pub mod drives;
+mod class_soil;
+mod drives;
 mod features;
 pub mod initial;
 pub mod origin;
-pub mod pooling;
+mod pooling;
 pub mod recipe;
 pub mod rims;
 pub mod scales;
-pub mod schedule;
+mod schedule;
 pub mod stand_in;
 pub mod suspension;
 pub mod symbolic;
-pub mod trainer;
+mod trainer;
 
 pub use drives::{Drive, encode_drives};
 pub use pooling::Pooling;

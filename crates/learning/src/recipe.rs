@@ -427,7 +427,9 @@ fn write(path: &Path, bytes: &[u8]) -> Result<(), TrainingError> {
     if let Some(parent) = path.parent() {
         std::fs::create_dir_all(parent).map_err(|e| fail(e.to_string()))?;
     }
-    std::fs::write(path, bytes).map_err(|e| fail(e.to_string()))
+    // A run that is killed meanwhile leaves no part under the name that the next run reads.
+    let unfinished = path.with_extension("new");
+    std::fs::write(&unfinished, bytes).and_then(|()| std::fs::rename(&unfinished, path)).map_err(|e| fail(e.to_string()))
 }
 
 #[cfg(test)]

@@ -13,7 +13,7 @@ use nesam_model::reference::{ComputeDevice, KvCache, Network, ReferencePredictor
 use nesam_model::{
     CacheCounts, MeasuredWheels, ModelBundle, Normalization, Order, Path, Precision, Predictor, RolloutQuery, Variant, Weights,
 };
-use nesam_physics::{STATE_DIM, SoilCorrection, VehicleState};
+use nesam_physics::{Control, STATE_DIM, SoilCorrection, VehicleState};
 use nesam_terrain::{Pose2, WorldMap};
 
 fn pose(s: &VehicleState<f64>) -> Pose2 {
@@ -30,7 +30,7 @@ fn compare_weights(map: Option<&Arc<WorldMap>>, history: usize, variant: Variant
     let predictor = predictor(scales, weights.clone());
     let start = 33;
     let past = drive.history(start - history, start);
-    let controls: Vec<f32> = drive.controls[start..start + 32].iter().flat_map(|c| [c.speed_m_s as f32, c.second as f32]).collect();
+    let controls: Vec<f32> = drive.controls[start..start + 32].iter().flat_map(Control::packed).collect();
     let query = RolloutQuery {
         history: &past,
         start: drive.states[start],

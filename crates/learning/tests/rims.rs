@@ -86,7 +86,7 @@ fn analytic_a_servo_is_found_from_the_motion_alone() {
     let made = |seed: f64| {
         let control = Control { speed_m_s: 1.5 + (1.7 * seed).sin(), second: (2.9 * seed + 1.0).sin() * 0.6 };
         let start = VehicleState { velocity_m_s: [0.0; 3], angular_velocity_rad_s: [0.0; 3], ..sample.states[0] };
-        let controls = [control.speed_m_s as f32, control.second as f32].repeat(25);
+        let controls = control.packed().repeat(25);
         let query = RolloutQuery {
             history: &[],
             start,

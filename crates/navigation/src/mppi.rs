@@ -67,7 +67,7 @@ impl Mppi {
                 self.candidates.push(Control { speed_m_s: clamp(base.speed_m_s + noise[0], 0), second: clamp(base.second + noise[1], 1) });
             }
         }
-        self.candidates.iter().flat_map(|c| [c.speed_m_s as f32, c.second as f32]).collect()
+        self.candidates.iter().flat_map(Control::packed).collect()
     }
 
     /// Moves the plan to the weighted mean of the candidates, one cost each, and takes its first command off it.

@@ -247,7 +247,7 @@ pub(crate) fn unlimited(limited_m_s: f64, limit_m_s: f64) -> f64 {
 pub struct WheelCommand<T> {
     /// Road-wheel angle, rad, positive left.
     pub angle_rad: [T; WHEELS],
-    /// Rim speed = `rim_base` + `rim_follow` · (wheel's own forward speed) + `rim_gain` · (speed command - forward speed of the vehicle).
+    /// Rim speed = `rim_base_m_s` + `rim_follow` · (wheel's own forward speed) + `rim_gain` · (speed command - forward speed of the vehicle).
     pub rim_base_m_s: [T; WHEELS],
     /// 1 when the rim follows the ground under it (speed-controlled vehicle), 0 when it is servoed or measured.
     pub rim_follow: T,

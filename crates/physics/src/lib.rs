@@ -23,10 +23,10 @@ mod vehicle;
 
 pub use command_path::CommandPath;
 pub use contacts::{ROLLING, Rolling, SUNK, Sunk, Wheels};
-pub use contradiction::{CONTRADICTIONS, contradiction};
+pub use contradiction::{CONTRADICTIONS, contradiction, unseen};
 pub use ride::{Ride, UsualRide};
 pub use scalar::Real;
 pub use soil::{HARD_GROUND, SOIL_BOUNDS, SOIL_DIM, SOIL_NAMES, SOIL_UNITS, Soil};
 pub use soil_correction::{SOIL_LOGARITHMIC, SoilCoordinates, SoilCorrection};
-pub use state::{Control, DT_S, STATE_DIM, VehicleState, wrap_angle};
+pub use state::{Control, DT_S, POINT_MAX_M, STATE_DIM, VehicleState, wrap_angle};
 pub use vehicle::{Driveline, RimServo, SecondCommand, SteeringTable, TORQUE_KNOTS, TorqueDrive, Vehicle, WHEELS};

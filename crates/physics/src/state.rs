@@ -26,6 +26,9 @@ pub struct VehicleState<T> {
     pub angular_velocity_rad_s: [T; 3],
 }
 
+/// Farthest that a point of the vehicle lies from its reference point along an axis, m: what is farther was not given in metres.
+pub const POINT_MAX_M: f64 = 20.0;
+
 impl<T: Copy> VehicleState<T> {
     /// The state as the twelve numbers of the paper's order: position, attitude, velocity, angular velocity.
     pub fn to_array(&self) -> [T; STATE_DIM] {
@@ -91,6 +94,13 @@ impl<T: Copy> Control<T> {
     /// The same command in another scalar.
     pub fn map<U>(&self, f: impl Fn(T) -> U) -> Control<U> {
         Control { speed_m_s: f(self.speed_m_s), second: f(self.second) }
+    }
+}
+
+impl Control<f64> {
+    /// Both numbers in single precision, as predictions take them: row-major (steps, 2).
+    pub fn packed(&self) -> [f32; 2] {
+        [self.speed_m_s as f32, self.second as f32]
     }
 }
 

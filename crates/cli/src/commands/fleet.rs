@@ -176,7 +176,7 @@ fn feed(engine: &mut Engine, now_ns: u64, vehicle: &str, drive: &Trajectory, sam
 
 /// Poses after steps 1…K from the newest measurement, with the commands of the drive.
 fn predict(engine: &mut Engine, now_ns: u64, drive: &Trajectory, sample: usize, horizon: usize) -> Result<Vec<[f64; POSE_DIM]>, Failure> {
-    let controls = drive.controls[sample..sample + horizon].iter().flat_map(|c| [c.speed_m_s as f32, c.second as f32]).collect();
+    let controls = drive.controls[sample..sample + horizon].iter().flat_map(|control| control.packed()).collect();
     let query = PredictQuery {
         session: "driver".into(),
         start: None,

@@ -192,7 +192,7 @@ fn rollout(
     controls: &[Control<f64>],
     map: Option<&Arc<WorldMap>>,
 ) -> Result<Rollout, Failure> {
-    let packed: Vec<f32> = controls.iter().flat_map(|c| [c.speed_m_s as f32, c.second as f32]).collect();
+    let packed: Vec<f32> = controls.iter().flat_map(Control::packed).collect();
     let variant = match args.model {
         ModelArg::Nesam => Variant::Full,
         ModelArg::NesamNoResidual => Variant::NoResidual,

@@ -64,7 +64,7 @@ impl Engine {
             predictor: if query.extras.exact_terrain { predictor.exactly() } else { predictor.clone() },
             map: map.cloned(),
             start,
-            start_stamp_ns: newest.map(|newest| newest.stamp_ns - forward.back() as i64 * self.step_ns),
+            start_stamp_ns: newest.map(|newest| newest.stamp_ns.saturating_sub(forward.back() as i64 * self.step_ns)),
             history,
             soils,
             learned: session.soil_field(map),

@@ -138,6 +138,6 @@ impl Alarm {
 
     /// The command that diagnoses what was recorded of the episode; `RECORDING` stands for the recording of the server.
     pub fn diagnose(&self, session: &str) -> String {
-        format!("nesam diagnose --recording RECORDING --session {session} --from-ns {}", self.onset_ns)
+        format!("nesam diagnose --recording RECORDING --session={session} --from-ns {}", self.onset_ns)
     }
 }

@@ -3,6 +3,7 @@
 use std::collections::VecDeque;
 
 use super::numbers::Numbers;
+use crate::clock::seconds;
 use crate::error::EngineError;
 use crate::limits::Limits;
 use crate::measurement::{Measurement, Outcome};
@@ -52,6 +53,7 @@ pub(super) struct Suspect {
     first_stamp_ns: i64,
     first_arrival_ns: u64,
     last: Numbered,
+    last_arrival_ns: u64,
     count: u32,
 }
 
@@ -160,13 +162,19 @@ impl Order {
     /// so. Otherwise the stamps have to keep pace with the arrivals, as no burst of resent measurements does.
     fn suspects(&mut self, kind: OffLine, measurement: &Measurement, now_ns: u64, step_ns: i64) -> bool {
         let here: Numbered = (measurement.stamp_ns, measurement.sequence);
-        let follows = |last: Numbered| {
-            let interval = here.0.saturating_sub(last.0);
-            interval > 0 && interval <= step_ns / 2 * 3 && here.1.zip(last.1).is_none_or(|(number, before)| number > before)
+        // The next step, or one after as much time as has passed: a slow sensor, or a link that loses some.
+        let follows = |suspect: &Suspect| {
+            let interval = here.0.saturating_sub(suspect.last.0);
+            let passed = seconds(now_ns.saturating_sub(suspect.last_arrival_ns) as i64);
+            let is_next = interval <= step_ns / 2 * 3 || keeps_pace(seconds(interval), passed);
+            interval > 0 && is_next && here.1.zip(suspect.last.1).is_none_or(|(number, before)| number > before)
         };
+        let (last, last_arrival_ns) = (here, now_ns);
         let suspect = match self.suspect {
-            Some(suspect) if suspect.kind == kind && follows(suspect.last) => Suspect { last: here, count: suspect.count + 1, ..suspect },
-            _ => Suspect { kind, first_stamp_ns: here.0, first_arrival_ns: now_ns, last: here, count: 1 },
+            Some(suspect) if suspect.kind == kind && follows(&suspect) => {
+                Suspect { last, last_arrival_ns, count: suspect.count + 1, ..suspect }
+            }
+            _ => Suspect { kind, first_stamp_ns: here.0, first_arrival_ns: now_ns, last, last_arrival_ns, count: 1 },
         };
         self.suspect = Some(suspect);
         let by_count = match kind {
@@ -177,10 +185,9 @@ impl Order {
         if by_count {
             return suspect.count >= PROOF_COUNT;
         }
-        let elapsed_s = now_ns.saturating_sub(suspect.first_arrival_ns) as f64 * 1e-9;
+        let elapsed_s = seconds(now_ns.saturating_sub(suspect.first_arrival_ns) as i64);
         let advance_s = seconds(here.0.saturating_sub(suspect.first_stamp_ns));
-        let paced = advance_s >= 0.5 * elapsed_s && advance_s <= 2.0 * elapsed_s;
-        elapsed_s >= PROOF_PACE.0 && suspect.count >= PROOF_PACE.1 && paced
+        elapsed_s >= PROOF_PACE.0 && suspect.count >= PROOF_PACE.1 && keeps_pace(advance_s, elapsed_s)
     }
 
     /// Notes an accepted measurement. Says whether it is the newest.
@@ -224,11 +231,12 @@ impl Order {
     }
 }
 
+/// Whether stamps go on about as fast as they arrive.
+fn keeps_pace(advance_s: f64, elapsed_s: f64) -> bool {
+    (0.5 * elapsed_s..=2.0 * elapsed_s).contains(&advance_s)
+}
+
 /// Whether a number is none that comes after the last one.
 fn counted(sequence: Option<u64>, last: Option<u64>) -> bool {
     matches!((sequence, last), (Some(number), Some(last)) if number <= last)
-}
-
-fn seconds(ns: i64) -> f64 {
-    ns as f64 * 1e-9
 }

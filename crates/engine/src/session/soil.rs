@@ -6,11 +6,11 @@ use std::sync::Arc;
 use nesam_adaptation::{BufferedTransition, ClassBelief, Innovation, SoilFilter, SoilUpdate};
 use nesam_fleet_soil::{FleetPrior, FleetSoilError, Increment, SoilBelief};
 use nesam_model::{HISTORY, HistoryStep, Predictor, SoilByClass, SoilField};
-use nesam_physics::{CONTRADICTIONS, SOIL_DIM, SoilCorrection, contradiction};
+use nesam_physics::{CONTRADICTIONS, SOIL_DIM, SoilCorrection, contradiction, unseen};
 use nesam_terrain::WorldMap;
 
-use super::seconds;
 use super::track::Stamped;
+use crate::clock::seconds;
 use crate::fleet::Brought;
 
 /// What the fleet may say at most on whether the correction helps, log odds: from odds of e⁻⁴ before any evidence to e, so that a vehicle that finds it wrong
@@ -77,6 +77,8 @@ pub(super) struct Judged {
     pub learned: Option<Learned>,
     /// How its sensors contradict each other, see [`contradiction`].
     pub contradiction: [f64; CONTRADICTIONS],
+    /// How much of that may have happened between two samples, see [`unseen`].
+    pub unseen: [f64; CONTRADICTIONS],
     /// The vehicle stood and was told to: nothing moves, so nothing can disagree.
     pub standing: bool,
 }
@@ -173,9 +175,10 @@ impl SoilLearner {
     fn judged(&self, predictor: &Predictor, learned: Option<Learned>, standing: bool) -> Judged {
         let (first, last) = (self.first, self.steps.len() - 1);
         let states: Vec<_> = self.steps[first..=last].iter().map(|step| predictor.true_state(&step.state)).collect();
-        let contradiction = contradiction(&states, |k| seconds(self.stamps_ns[k + 1].saturating_sub(self.stamps_ns[k])));
+        let step_s = |k: usize| seconds(self.stamps_ns[k + 1].saturating_sub(self.stamps_ns[k]));
+        let (contradiction, unseen) = (contradiction(&states, step_s), unseen(&states, step_s));
         let stamps_ns = [self.stamps_ns[0], self.stamps_ns[last - first]];
-        Judged { stamps_ns, learned, contradiction, standing }
+        Judged { stamps_ns, learned, contradiction, unseen, standing }
     }
 
     /// What the filter makes of the full buffer.

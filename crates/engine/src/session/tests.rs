@@ -357,6 +357,26 @@ fn analytic_clocks_that_jump_are_believed_the_second_time() {
     assert_eq!(observe_at(&mut session, &at(36_000 * STEP_NS), 3_600_000_000_000).map(|o| o.label()), Ok("gap"));
 }
 
+/// Goal: a clock that is set, or a vehicle that starts again, is believed however seldom it measures. Method: stamps and arrivals in steps of 0.15 to 1 s, as of a
+/// slow sensor or a link that loses some, ahead, back and of another start.
+#[test]
+fn analytic_a_clock_is_believed_of_vehicles_that_measure_seldom() {
+    for step in [STEP_NS * 3 / 2, STEP_NS * 8 / 5, 2 * STEP_NS, 3 * STEP_NS, 10 * STEP_NS] {
+        let labels = |shift_ns: i64, boot: Option<u64>| -> Vec<&str> {
+            let mut session = driven(0);
+            let hour_ns = 3_600_000_000_000;
+            let one = |k: i64, shift: i64, boot: Option<u64>| Measurement { boot, ..at(hour_ns + k * step + shift) };
+            for k in 0..10 {
+                assert!(observe_at(&mut session, &one(k, 0, boot.map(|_| 1)), (k * step) as u64).unwrap().accepted());
+            }
+            (10..18).map(|k| observe_at(&mut session, &one(k, shift_ns, boot), (k * step) as u64).unwrap().label()).collect()
+        };
+        assert_eq!(labels(3_600_000_000_000, None)[..2], ["future", "clock_jump"], "{step}");
+        assert!(labels(-3_000_000_000_000, None).contains(&"clock_jump"), "{step}");
+        assert_eq!(labels(-3_000_000_000_000, Some(2))[..2], ["too_old", "restarted"], "{step}");
+    }
+}
+
 #[test]
 fn analytic_dense_stamps_are_thinned_and_gaps_restart_the_history() {
     let mut session = driven(1);

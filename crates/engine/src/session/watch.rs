@@ -73,8 +73,15 @@ pub(crate) struct WatchedBuffer {
 }
 
 impl WatchedBuffer {
-    /// `agreement` is that of the motion with its prediction, where there was one.
-    pub fn new(stamps_ns: [i64; 2], agreement: Option<&Agreement>, contradiction: [f64; CONTRADICTIONS]) -> Self {
+    /// `agreement` is that of the motion with its prediction, where there was one; `contradiction` that of its sensors, of which `unseen` may be a blow between
+    /// two samples. Where that alone would raise an alarm, a channel counts as agreeing.
+    pub fn new(
+        stamps_ns: [i64; 2],
+        agreement: Option<&Agreement>,
+        contradiction: [f64; CONTRADICTIONS],
+        unseen: [f64; CONTRADICTIONS],
+    ) -> Self {
+        let contradiction = core::array::from_fn(|c| if unseen[c] > SENSOR_JUMP * sensor_sd(c, 1.0, 1.0) { 0.0 } else { contradiction[c] });
         let Some(agreement) = agreement else {
             let expected = [0.0; VELOCITY_DIM];
             return Self { stamps_ns, nis: 1.0, normalised: expected, mean: expected, contradiction, weighed: [0.0; 2] };
@@ -117,6 +124,11 @@ pub(crate) struct Watch {
     pub active: Option<Alarm>,
     /// Calm buffers in a row.
     pub calm: u32,
+}
+
+/// Standard deviation of what sensors contradict each other by in a channel over some buffers in stretches without a gap, m or rad.
+fn sensor_sd(channel: usize, buffers: f64, stretches: f64) -> f64 {
+    (SENSOR_ENDS_SD[channel].powi(2) * stretches + SENSOR_BUFFER_SD[channel].powi(2) * buffers).sqrt()
 }
 
 /// What a test says of the window.
@@ -197,7 +209,7 @@ impl Watch {
     fn alarm(&self, raised: &Reading) -> Alarm {
         let since = self.window.range(raised.onset..);
         let mean = |of: &dyn Fn(&WatchedBuffer) -> f64| since.clone().map(of).sum::<f64>() / since.len().max(1) as f64;
-        let seconds = |b: &WatchedBuffer| (b.stamps_ns[1] - b.stamps_ns[0]).max(1) as f64 * 1e-9;
+        let seconds = |b: &WatchedBuffer| b.stamps_ns[1].saturating_sub(b.stamps_ns[0]).max(1) as f64 * 1e-9;
         let size = match raised.channel {
             Some(c) if c < VELOCITY_DIM => mean(&|b| b.mean[c]),
             Some(c) => mean(&|b| b.contradiction[c - VELOCITY_DIM] / seconds(b)),
@@ -248,9 +260,7 @@ impl Watch {
     }
 
     fn sensor_jump(&self) -> Option<Reading> {
-        let sd =
-            |c: usize, count: f64, stretches: f64| (SENSOR_ENDS_SD[c].powi(2) * stretches + SENSOR_BUFFER_SD[c].powi(2) * count).sqrt();
-        let (c, statistic, onset) = self.jump(1, |b| b.contradiction, sd)?;
+        let (c, statistic, onset) = self.jump(1, |b| b.contradiction, sensor_sd)?;
         Some(Reading { kind: AlarmKind::SensorJump, channel: Some(VELOCITY_DIM + c), statistic, threshold: SENSOR_JUMP, onset })
     }
 

@@ -10,7 +10,7 @@ use super::scale::{Linear, label, ticks};
 pub struct Series {
     /// Name in the legend and in hover texts.
     pub name: String,
-    /// Index of the colour and dash, 0 (ink) … 6.
+    /// Index of the look: colour and dash, 0 = ink, no two of the first 21 alike.
     pub colour: usize,
     /// Points.
     pub points: Vec<(f64, f64)>,
@@ -24,6 +24,12 @@ impl Series {
     /// A plain line.
     pub fn line(name: &str, colour: usize, points: Vec<(f64, f64)>) -> Self {
         Self { name: name.into(), colour, points, ..Self::default() }
+    }
+
+    /// Each time the colours are through they come with other dashes.
+    fn dash(&self) -> &'static str {
+        let count = DASHES.len();
+        DASHES[(self.colour + 2 * (self.colour / count)) % count]
     }
 }
 
@@ -65,7 +71,7 @@ impl LinePlot {
                 html,
                 "<span><svg viewBox=\"0 0 34 10\"><path class=\"line s{}\" stroke-dasharray=\"{}\" d=\"M1 5H33\"/></svg>{}</span>",
                 s.colour % DASHES.len(),
-                DASHES[s.colour % DASHES.len()],
+                s.dash(),
                 escape(&s.name)
             );
         }
@@ -180,7 +186,7 @@ fn draw_band(svg: &mut String, s: &Series, x: &Linear, y: &Linear) {
 fn draw_line(svg: &mut String, s: &Series, x: &Linear, y: &Linear) {
     let c = s.colour % DASHES.len();
     let d = path(s.points.iter().copied(), x, y);
-    let _ = writeln!(svg, "<path class=\"line s{c}\" stroke-dasharray=\"{}\" d=\"{d}\"/>", DASHES[c]);
+    let _ = writeln!(svg, "<path class=\"line s{c}\" stroke-dasharray=\"{}\" d=\"{d}\"/>", s.dash());
     if let (true, Some((px, py))) = (s.mark_start, s.points.first()) {
         let _ = writeln!(svg, "<circle class=\"s{c}\" cx=\"{:.1}\" cy=\"{:.1}\" r=\"3.5\"/>", x.at(*px), y.at(*py));
     }
@@ -197,5 +203,16 @@ fn draw_hits(svg: &mut String, s: &Series, x: &Linear, y: &Linear) {
             y.at(*py),
             escape(&s.name)
         );
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn analytic_as_many_models_as_there_are_look_different() {
+        let looks: std::collections::BTreeSet<_> = (0..21).map(|i| (i % DASHES.len(), Series::line("", i, Vec::new()).dash())).collect();
+        assert_eq!(looks.len(), 21);
     }
 }

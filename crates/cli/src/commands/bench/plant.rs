@@ -63,7 +63,7 @@ pub(super) struct PlantBench {
     /// Worlds, one drive after the other
     #[arg(long, value_name = "ID,…", value_delimiter = ',', required = true)]
     worlds: Vec<String>,
-    /// Effects to hide, one at a time [default: fifteen of `nesam plant effects`]
+    /// Effects to hide, one at a time [default: the sixteen that have a usual size, of `nesam plant effects`]
     #[arg(long, value_name = "ID,…", value_delimiter = ',')]
     effects: Vec<String>,
     /// Sizes, as multiples of the usual one of each effect

@@ -63,6 +63,8 @@ pub(super) struct ServeBench {
 
 /// Askers that measure the capacity.
 const ASKERS: usize = 4;
+/// Largest number that an option admits: times beyond are none of a machine.
+const NUMBER_MAX: f64 = 1e6;
 
 /// What became of the queries of one load.
 #[derive(Debug, Default)]
@@ -88,8 +90,8 @@ pub(super) fn run(args: &ServeBench) -> Result<(), Failure> {
     let times = [("--deadline-ms", args.deadline_ms), ("--seconds", args.seconds)];
     let loads = args.loads.iter().map(|load| ("--loads", *load));
     let mut numbers = counts.map(|(name, count)| (name, count as f64)).into_iter().chain(times).chain(loads);
-    if let Some((name, value)) = numbers.find(|(_, value)| !(*value > 0.0 && value.is_finite())) {
-        return Err(Failure::input(format!("{name} must be positive and finite, not {value}")));
+    if let Some((name, value)) = numbers.find(|(_, value)| !(*value > 0.0 && *value <= NUMBER_MAX)) {
+        return Err(Failure::input(format!("{name} must be positive and at most {NUMBER_MAX}, not {value}")));
     }
     restart_with(&OF_A_SERVER)?;
     exit_on_ctrl_c("nothing was written");

@@ -117,7 +117,7 @@ fn stage_of(args: &DemoArgs, drives: &Drives) -> Result<Stage, Failure> {
     let is_test = |i: &usize| drives.drives[*i].split == Some(nesam_trajectories::Split::Test);
     let at = if args.data.split == SplitArg::All { (0..drives.drives.len()).find(is_test).unwrap_or(0) } else { 0 };
     let drive = drives.drives[at].clone();
-    let asked = args.seconds.map_or(usize::MAX, |s| (s / drive.dt_s).round() as usize + 1);
+    let asked = args.seconds.map_or(usize::MAX, |s| ((s / drive.dt_s).round() as usize).saturating_add(1));
     let samples = drive.states.len().min(asked);
     if samples <= planner::HORIZON {
         let shortest = planner::HORIZON as f64 * drive.dt_s;

@@ -13,6 +13,7 @@ use nesam_plant::{Command, Ground, HiddenEffects, Plant, PlantVehicle, Truth, WH
 use nesam_trajectories::{GroundTruth, Trajectory};
 use serde_json::{Value, json};
 
+use super::BEFORE;
 use crate::args::DataArgs;
 use crate::failure::{Failure, OrFail};
 use crate::interrupt::exit_on_ctrl_c;
@@ -26,8 +27,6 @@ const EVERY: usize = 40;
 const FIRST: usize = 32;
 /// Free steps after which errors are reported.
 const REPORTED: [usize; 3] = [10, 20, 32];
-/// Steps at rest and of straight acceleration before a recorded drive begins.
-const BEFORE: [usize; 2] = [10, 15];
 
 /// Options of `nesam plant check`.
 #[derive(Args, Debug)]

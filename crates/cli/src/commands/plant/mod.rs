@@ -16,6 +16,9 @@ use crate::failure::{Failure, OrFail};
 use crate::output::say;
 use crate::sources::open_root;
 
+/// Steps at rest and of straight acceleration before a drive begins.
+const BEFORE: [usize; 2] = [10, 15];
+
 /// Options of `nesam plant`.
 #[derive(Args, Debug)]
 pub struct PlantArgs {

@@ -9,15 +9,13 @@ use nesam_plant::{Command, Drive, DriveRecorder, Ground, HiddenEffects, Plant, P
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
-use super::{effects_of, root_of};
+use super::{BEFORE, effects_of, root_of};
 use crate::args::check_count;
 use crate::bundle_path::inside_bundle;
 use crate::failure::{Failure, OrFail};
 use crate::output::{say, set_exists};
 use crate::progress::Progress;
 
-/// Steps at rest and of straight acceleration before a drive begins.
-const BEFORE: [usize; 2] = [10, 15];
 /// A drive ends this close to the edge of the ground, m.
 const BORDER_M: f64 = 4.0;
 /// Starts lie inside a square of this half edge about the origin of World, m.
