@@ -39,6 +39,8 @@ pub struct EvidenceParts {
 
 /// Other maps that are remembered at most; beyond, the one with the oldest evidence is forgotten.
 const HEARD_MAX: usize = 64;
+/// Share of all cells that is forgotten at a time, so that a full map is not searched for each increment.
+const FORGOTTEN_AT_ONCE: usize = 64;
 /// Share of its weight below which evidence of another map is not taken any more.
 const FADED: f64 = 1e-3;
 /// What rounding may make of Λ, as a share of its largest entry: a difference of two entries that should be equal, a diagonal below 0.
@@ -68,6 +70,8 @@ pub struct FleetSoilMap {
     revision: u64,
     /// What was brought to other maps, by their names.
     heard: BTreeMap<String, Cells>,
+    /// Instant of the newest evidence that was forgotten for want of space, s: what is told from before is not taken again.
+    forgotten_s: f64,
 }
 
 impl CellEvidence {
@@ -137,7 +141,7 @@ impl FleetSoilMap {
     /// As [`FleetSoilSettings::check`].
     pub fn new(settings: FleetSoilSettings) -> Result<Self, FleetSoilError> {
         settings.check()?;
-        Ok(Self { settings, own: Cells::new(), revision: 0, heard: BTreeMap::new() })
+        Ok(Self { settings, own: Cells::new(), revision: 0, heard: BTreeMap::new(), forgotten_s: f64::NEG_INFINITY })
     }
 
     /// Settings.
@@ -184,25 +188,48 @@ impl FleetSoilMap {
         };
         let half_life_s = self.settings.half_life_s;
         self.own.entry(key).and_modify(|cell| *cell = cell.with(&brought, half_life_s)).or_insert(brought);
-        limit(&mut self.own, self.settings.cells_max);
+        self.limit();
     }
 
-    /// Takes what another map tells of a cell, brought to the map `of`. Returns whether it was news: what has faded, or is no later than what was heard before, is not.
+    /// Takes what another map tells of a cell, brought to the map `of`. Returns whether it was news: what has faded, is no later than what was heard before, or
+    /// is older than all that there is space for, is not.
     pub fn hear(&mut self, of: &str, key: CellKey, evidence: &CellEvidence, now_s: f64) -> bool {
         let faded = evidence.aged(now_s, self.settings.half_life_s) < FADED;
         let known = self.heard.get(of).and_then(|cells| cells.get(&key));
-        if faded || known.is_some_and(|known| known.revision >= evidence.revision) {
+        if faded || evidence.stamp_s <= self.forgotten_s || known.is_some_and(|known| known.revision >= evidence.revision) {
             return false;
         }
-        let cells = self.heard.entry(of.into()).or_default();
-        cells.insert(key, *evidence);
-        limit(cells, self.settings.cells_max);
+        self.heard.entry(of.into()).or_default().insert(key, *evidence);
+        self.limit();
         if self.heard.len() > HEARD_MAX {
             let newest = |cells: &Cells| cells.values().map(CellEvidence::stamp_s).fold(f64::NEG_INFINITY, f64::max);
             let oldest = self.heard.iter().min_by(|a, b| newest(a.1).total_cmp(&newest(b.1))).map(|(name, _)| name.clone());
             oldest.and_then(|name| self.heard.remove(&name));
         }
-        true
+        self.heard.contains_key(of)
+    }
+
+    /// Forgets the oldest evidence beyond the number of cells, whoever it was brought to.
+    fn limit(&mut self) {
+        let most = self.settings.cells_max;
+        if self.own.len() + self.heard.values().map(Cells::len).sum::<usize>() <= most {
+            return;
+        }
+        let all = || core::iter::once(&self.own).chain(self.heard.values()).flat_map(Cells::values).map(CellEvidence::stamp_s);
+        let mut stamps_s: Vec<f64> = all().collect();
+        let surplus = stamps_s.len() - (most - most / FORGOTTEN_AT_ONCE);
+        let (_, &mut newest_s, _) = stamps_s.select_nth_unstable_by(surplus - 1, f64::total_cmp);
+        // Of those of the same instant as many as there is no space for.
+        let mut of_then = surplus - all().filter(|stamp_s| *stamp_s < newest_s).count();
+        let mut is_kept = |_: &CellKey, evidence: &mut CellEvidence| {
+            let goes = evidence.stamp_s < newest_s || (evidence.stamp_s == newest_s && of_then > 0);
+            of_then -= usize::from(goes && evidence.stamp_s == newest_s);
+            !goes
+        };
+        self.own.retain(&mut is_kept);
+        self.heard.values_mut().for_each(|cells| cells.retain(&mut is_kept));
+        self.heard.retain(|_, cells| !cells.is_empty());
+        self.forgotten_s = self.forgotten_s.max(newest_s);
     }
 
     /// What a vehicle that begins at a position knows: P₀ around Δθ = 0, and the evidence of this map, each cell weighted by 2^(-age / half-life) e^(-distance / reach) of
@@ -243,14 +270,6 @@ impl FleetSoilMap {
             buffers,
             votes,
         })
-    }
-}
-
-/// Forgets the oldest evidence beyond a number of cells.
-fn limit(cells: &mut Cells, cells_max: usize) {
-    if cells.len() > cells_max {
-        let oldest = cells.iter().min_by(|a, b| a.1.stamp_s.total_cmp(&b.1.stamp_s)).map(|(key, _)| key.clone());
-        oldest.and_then(|key| cells.remove(&key));
     }
 }
 
@@ -342,6 +361,34 @@ mod tests {
         assert_eq!(small.cells().keys().map(|key| key.cell[0]).collect::<Vec<_>>(), [6, 7, 8]);
         assert!(Increment::between(&belief(0.0, -1.0), &belief(0.0, 1.0), 0.0).is_err());
         assert!(FleetSoilMap::new(FleetSoilSettings { cell_m: 0.0, ..FleetSoilSettings::default() }).is_err());
+    }
+
+    #[test]
+    fn property_the_limit_holds_for_all_maps_together_and_what_was_forgotten_is_no_news() {
+        let increment = update((0.0, 1.0), 2.0, 0.5).1;
+        let mut map = FleetSoilMap::new(FleetSoilSettings { cells_max: 128, ..FleetSoilSettings::default() }).unwrap();
+        let mut others = [0, 1].map(|_| exact());
+        for i in 0..100 {
+            map.add(key(i), &increment, 3.0 * f64::from(i));
+            others.iter_mut().enumerate().for_each(|(o, other)| other.add(key(i), &increment, 3.0 * f64::from(i) + o as f64 + 1.0));
+        }
+        let mut held = |names: [&str; 2]| -> usize {
+            let news = others.iter().zip(names).map(|(other, name)| tell(other, name, &mut map, "m", 300.0)).sum();
+            let cells = map.by_map().map(|(_, cells)| cells.len()).sum::<usize>();
+            assert!((126..=128).contains(&cells), "{cells}");
+            // The newest 126 of three times 100, so a good 40 of each.
+            assert!(map.by_map().all(|(_, cells)| cells.len() >= 41 && cells.values().all(|cell| cell.stamp_s() >= 170.0)));
+            news
+        };
+        assert!(held(["a", "b"]) > 80);
+        assert_eq!(held(["a", "b"]), 0, "what was forgotten is not heard again and again");
+    }
+
+    #[test]
+    fn analytic_evidence_of_one_instant_is_not_forgotten_altogether() {
+        let mut map = FleetSoilMap::new(FleetSoilSettings { cells_max: 3, ..FleetSoilSettings::default() }).unwrap();
+        (0..5).for_each(|i| map.add(key(i), &update((0.0, 1.0), 2.0, 0.5).1, 7.0));
+        assert_eq!(map.cells().len(), 3);
     }
 
     /// What one map tells another: everything it knows.

@@ -2,6 +2,9 @@
 
 use crate::error::FleetSoilError;
 
+/// Most cells of a map: as many as one answer to another server holds.
+const CELLS_MAX: usize = 131_072;
+
 /// Settings of a [`crate::FleetSoilMap`]. All defaults are chosen.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct FleetSoilSettings {
@@ -16,7 +19,7 @@ pub struct FleetSoilSettings {
     /// Process noise, as share of the standard deviations of the filter's own prior: ground of one look differs from place to place and from day to day, however much
     /// was measured of it.
     pub process_share: f64,
-    /// Cells held at most; beyond, the one with the oldest evidence is forgotten.
+    /// Cells held at most, brought to this map and heard of others together; beyond, those with the oldest evidence are forgotten.
     pub cells_max: usize,
 }
 
@@ -43,8 +46,11 @@ impl FleetSoilSettings {
                 reason: format!("is {}, it must be at least 0", self.process_share),
             });
         }
-        if self.cells_max == 0 {
-            return Err(FleetSoilError::Setting { setting: "cells_max", reason: "is 0, at least 1 is needed".into() });
+        if !(1..=CELLS_MAX).contains(&self.cells_max) {
+            return Err(FleetSoilError::Setting {
+                setting: "cells_max",
+                reason: format!("is {}, it must be 1 to {CELLS_MAX}", self.cells_max),
+            });
         }
         Ok(())
     }
