@@ -18,6 +18,10 @@ const DRIVE_MIN_S: f64 = 1.0;
 const MISSING_SHARE: f64 = 0.2;
 /// Times beyond this count from an epoch and are made to count from the start of the log, s.
 const EPOCH_S: f64 = 1e6;
+/// Rows that repeat a time stamp further than this from the row that is kept, and from where it goes, are elsewhere, m (chosen).
+const ELSEWHERE_M: f64 = 0.5;
+/// Share and number of rows, from which on such ones are those of another vehicle (chosen).
+const ELSEWHERE: (f64, usize) = (0.01, 10);
 /// Names of the second command.
 const SECOND: [&str; 3] = ["cmd_steer", "cmd_road_wheel_angle", "cmd_yaw_rate"];
 /// Channels that are used together or not at all; of velocities the third may be missing.
@@ -157,8 +161,9 @@ fn of_one_run(
 ) -> Result<Vec<Vec<(String, Vec<f64>)>>, ImportError> {
     let mut lacking = LeftOut::default();
     let posed = posed(channels, rows, &mut lacking);
-    let posed = ascending(log, &channels.time, posed, notes)?;
-    let told: Vec<Told> = channels.commands.iter().map(|(_, values)| Told::new(at_instants(&channels.time, values, rows))).collect();
+    let (posed, repeated) = ascending(log, channels, posed, notes)?;
+    let told_in: Vec<usize> = rows.iter().copied().filter(|row| repeated.binary_search(row).is_err()).collect();
+    let told: Vec<Told> = channels.commands.iter().map(|(_, values)| Told::new(at_instants(&channels.time, values, &told_in))).collect();
     let commanded = commanded(channels, &told, posed, name, &mut lacking, notes);
     let measured = kept(&channels.measured, &commanded, name, &mut lacking);
     let whole: Vec<Row> = commanded.into_iter().filter(|row| has_all(&measured, row.row, &mut lacking)).collect();
@@ -388,14 +393,15 @@ fn by_name(rows: usize, names: Option<&[String]>, default: &str) -> Vec<(String,
     drives
 }
 
-/// The rows without those that repeat a time stamp, each until the next one.
-fn ascending(log: &Log, time: &[Option<f64>], rows: Vec<usize>, notes: &mut Notes) -> Result<Vec<Row>, ImportError> {
-    let at = |row: usize| time[row].unwrap_or(f64::NAN);
+/// The rows without those that repeat a time stamp, each until the next one, and those that do.
+fn ascending(log: &Log, channels: &Channels, rows: Vec<usize>, notes: &mut Notes) -> Result<(Vec<Row>, Vec<usize>), ImportError> {
+    let at = |row: usize| channels.time[row].unwrap_or(f64::NAN);
     let mut kept: Vec<usize> = Vec::with_capacity(rows.len());
-    let mut repeated = 0;
+    // With their places among those that are kept.
+    let mut repeated: Vec<(usize, usize)> = Vec::new();
     for row in rows {
         match kept.last() {
-            Some(last) if at(row) == at(*last) => repeated += 1,
+            Some(last) if at(row) == at(*last) => repeated.push((row, kept.len() - 1)),
             Some(last) if at(row) < at(*last) => {
                 let reason = format!(
                     "line {}: time goes backwards, {} s after {} s, and does not go on from there: rows are out of order; sort the log, or name the drives with --column trajectory=COLUMN",
@@ -408,8 +414,11 @@ fn ascending(log: &Log, time: &[Option<f64>], rows: Vec<usize>, notes: &mut Note
             _ => kept.push(row),
         }
     }
-    if repeated > 0 {
-        notes.push(format!("{repeated} rows left out that repeat a time stamp"));
+    if let Some(reason) = two_in_one(log, channels, &kept, &repeated) {
+        return Err(ImportError::log(&log.path, reason));
+    }
+    if !repeated.is_empty() {
+        notes.push(format!("{} rows left out that repeat a time stamp", repeated.len()));
     }
     let usual_s = usual_step_s(kept.iter().map(|row| at(*row)));
     let limit_s = gap_limit_s(usual_s);
@@ -417,7 +426,31 @@ fn ascending(log: &Log, time: &[Option<f64>], rows: Vec<usize>, notes: &mut Note
     let lasts_s = if usual_s > 0.0 { usual_s } else { limit_s };
     let until_s = |i: usize| kept.get(i + 1).map(|next| at(*next)).filter(|next_s| next_s - at(kept[i]) <= limit_s);
     let span = |i: usize| Span { from_s: at(kept[i]), to_s: until_s(i).unwrap_or(at(kept[i]) + lasts_s) };
-    Ok((0..kept.len()).map(|i| Row { row: kept[i], span: span(i) }).collect())
+    let rows = (0..kept.len()).map(|i| Row { row: kept[i], span: span(i) }).collect();
+    Ok((rows, repeated.into_iter().map(|(row, _)| row).collect()))
+}
+
+/// Says of rows that repeat a time stamp, given with the places of the kept ones that they repeat, that they are not of the same vehicle.
+fn two_in_one(log: &Log, channels: &Channels, kept: &[usize], repeated: &[(usize, usize)]) -> Option<String> {
+    let place_m = |row: usize| [0, 1].map(|axis| channels.pose[axis].1[row].unwrap_or(f64::NAN));
+    let way_m = |a: usize, b: usize| {
+        let ([ax, ay], [bx, by]) = (place_m(a), place_m(b));
+        (bx - ax).hypot(by - ay)
+    };
+    // Where a clock is coarse or stands still, rows lie on the way to the next one that is kept.
+    let elsewhere = |(row, at): &(usize, usize)| {
+        let (apart_m, next_m) = (way_m(kept[*at], *row), way_m(kept[*at], *kept.get(at + 1)?));
+        (apart_m > next_m + ELSEWHERE_M).then_some((*row, apart_m))
+    };
+    let found: Vec<(usize, f64)> = repeated.iter().filter_map(elsewhere).collect();
+    let all = kept.len() + repeated.len();
+    let (row, apart_m) = *found.first().filter(|_| found.len() >= ELSEWHERE.1 && found.len() as f64 > ELSEWHERE.0 * all as f64)?;
+    Some(format!(
+        "{} of {all} rows repeat a time stamp at another place, first in line {}, {apart_m:.1} m apart: two vehicles or two publishers in one log? \
+         name the vehicles with --column trajectory=COLUMN, or leave one of them out",
+        found.len(),
+        log.places[row]
+    ))
 }
 
 /// Parts of a drive between gaps.

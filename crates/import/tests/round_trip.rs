@@ -436,3 +436,24 @@ fn chrono_a_log_of_another_point_gives_the_drive_of_the_reference_point() {
     let (drives, notes) = read(&no_gyro, &options).expect("a drive");
     assert!(column(&drives[0], "vbx").is_none() && notes.iter().any(|note| note.contains("has no yaw rate `wz`")), "{notes:?}");
 }
+
+/// Goal: of rows with one time stamp pose and command are of the same row, and rows of two vehicles are none of one. Method: rows that come twice, the second time with
+/// another command and 0.2 m away; the same with a vehicle 5 m away; a clock of whole seconds at 2 m/s.
+#[test]
+fn regress_rows_that_repeat_a_time_stamp_are_left_out_whole() {
+    let table = |row: &dyn Fn(u32) -> String| (0..200).fold("t,x,y,yaw,cmd_speed,cmd_yaw_rate\n".to_string(), |rows, k| rows + &row(k));
+    let twice = |way_m: f64| {
+        let row = |k: u32| {
+            let (t, x) = (0.1 * f64::from(k), 0.2 * f64::from(k));
+            format!("{t},{x},0,0,1,0\n{t},{},0,0,2,0\n", x + way_m)
+        };
+        read(&table(&row), &flat(&[]))
+    };
+    let (drives, notes) = twice(0.2).expect("a drive");
+    assert!(notes.iter().any(|note| note == "200 rows left out that repeat a time stamp"), "{notes:?}");
+    assert!(column(&drives[0], "cmd_speed").expect("there").iter().all(|told| *told == 1.0) && drives[0].time_s().len() == 200);
+    let told = twice(5.0).expect_err("two vehicles").to_string();
+    assert!(told.contains("199 of 400 rows repeat a time stamp at another place, first in line 3, 5.0 m apart: two vehicles"), "{told}");
+    let coarse = read(&table(&|k| format!("{},{},0,0,1,0\n", k / 10, 0.2 * f64::from(k))), &flat(&[]));
+    assert!(coarse.is_ok_and(|(drives, _)| drives[0].time_s().len() == 20));
+}

@@ -16,8 +16,6 @@ use crate::on_map;
 use crate::output::{check_apart, check_file, say, write_json};
 use crate::sources::{beyond_range_note, query};
 
-/// Coordinates beyond this are doubted, m: single precision has steps of 8 mm there (chosen).
-const FAR_M: f64 = 1e5;
 /// Steps of a second: shorter drives hold no prediction that says something (`nesam import` leaves them out).
 const PREDICTED_MIN: usize = 10;
 
@@ -192,8 +190,7 @@ fn check_set(root: &DataRoot, set: &str, findings: &mut Findings) {
         );
         findings.doubts.push(format!("set {set}: {what}; leave them out, or join them where they are parts of one drive"));
     }
-    let positions = drives.iter().flat_map(|d| &d.states).map(|s| s.position_m);
-    let all = recorded_doubts(&recorded).into_iter().chain(doubts(&drives, root.vehicle())).chain(far_from_origin(positions));
+    let all = recorded_doubts(&recorded).into_iter().chain(doubts(&drives, root.vehicle()));
     all.for_each(|doubt| findings.doubt(&format!("set {set}"), &doubt));
     let mut worlds: Vec<&str> = drives.iter().filter_map(|d| d.world.as_deref()).collect();
     worlds.sort_unstable();
@@ -213,38 +210,5 @@ fn check_set(root: &DataRoot, set: &str, findings: &mut Findings) {
     }
     for beyond in root.beyond_range(&drives) {
         findings.doubts.push(format!("set {set}: {}", beyond_range_note(&beyond)));
-    }
-}
-
-/// A doubt where positions are so large that what the service answers, in single precision, is coarse.
-fn far_from_origin(positions_m: impl Iterator<Item = [f64; 3]>) -> Option<Doubt> {
-    let farthest_m = positions_m.fold(0.0, |farthest: f64, [x, y, _]| farthest.max(x.abs()).max(y.abs()));
-    if farthest_m <= FAR_M {
-        return None;
-    }
-    let rounded = farthest_m as f32;
-    let step_m = f64::from(rounded.next_up()) - f64::from(rounded);
-    Some(Doubt {
-        what: format!("coordinates reach {:.0} km", farthest_m / 1e3),
-        advice: format!(
-            "`nesam evaluate` scores them unrounded, but states that the service answers are f32, in steps of {step_m:.2} m there: give it poses and \
-             maps from an origin nearby"
-        ),
-    })
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    /// Goal: coordinates that the wire rounds are told of, with by how much. Method: the steps of f32 below 2^17 (1/128 m) and from 2^22 on (1/2 m).
-    #[test]
-    fn analytic_coordinates_beyond_single_precision_are_doubted() {
-        let doubt = |x_m: f64, y_m: f64| far_from_origin([[0.0; 3], [x_m, y_m, 1e6]].into_iter());
-        assert_eq!(doubt(-9.9e4, 9.9e4), None);
-        let local = doubt(-1.01e5, 0.0).expect("beyond");
-        assert!(local.what.contains("101 km") && local.advice.contains("steps of 0.01 m"), "{local:?}");
-        let utm = doubt(431_000.0, 4_583_000.0).expect("beyond");
-        assert!(utm.what.contains("4583 km") && utm.advice.contains("steps of 0.50 m"), "{utm:?}");
     }
 }

@@ -11,6 +11,7 @@ use clap::{Args, ValueEnum};
 use nesam_import::{
     CONVERT, Drive, FrameConvention, Mapping, Options, Topics, doubts, drives, read_bag, read_csv, recorded_doubts, write_set,
 };
+use nesam_physics::POINT_MAX_M;
 use nesam_trajectories::{DataRoot, SetQuery, Trajectory, read_vehicle_card};
 
 use self::draft::Draft;
@@ -18,6 +19,7 @@ use crate::bundle_path::inside_bundle;
 use crate::failure::{Failure, OrFail};
 use crate::interrupt;
 use crate::output::{check_apart, check_file, say, set_exists, write_file};
+use crate::sources::beyond_range_note;
 
 /// Options of `nesam import`.
 #[derive(Args, Debug)]
@@ -70,9 +72,6 @@ pub struct ImportArgs {
     #[arg(long, value_name = "FILE")]
     html: Option<PathBuf>,
 }
-
-/// Furthest point of a vehicle, m.
-const POINT_MAX_M: f64 = 20.0;
 
 /// Plots of the drives, in the folder of their set.
 const PAGE: &str = "import.html";
@@ -305,8 +304,7 @@ fn judge(args: &ImportArgs, card: Option<&Path>, draft: &Draft) -> Result<(), Fa
         say!("  doubt: {}; {}", doubt.what, doubt.advice);
     }
     for beyond in root.beyond_range(&drives) {
-        let cost = if beyond.implied { "" } else { ", and no service would take that" };
-        say!("  doubt: {} drives command beyond the range of the card{cost}: {beyond}; see the units of the commands", beyond.drives);
+        say!("  doubt: {}; see the units of the commands", beyond_range_note(&beyond));
     }
     let own = draft.root().join(&args.set);
     let html = match &args.html {

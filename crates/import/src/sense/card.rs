@@ -37,17 +37,6 @@ pub fn card_doubts(vehicle: &Vehicle, mass_of_parts_kg: Option<f64>) -> Vec<Doub
         let what = format!("the mass is {:.1} kg, and chassis and wheels alone weigh {parts_kg:.1} kg", vehicle.mass_kg);
         found.push(doubt(what, "`mass_total` is that of the whole vehicle, with its load"));
     }
-    let [fl, fr, rl, rr] = vehicle.wheel_centre_m;
-    if fl[1] <= fr[1] || rl[1] <= rr[1] {
-        found
-            .push(doubt("the left wheels lie right of the right ones".into(), "y points to the left, and wheels are named FL, FR, RL, RR"));
-    }
-    if fl[0] <= rl[0] || fr[0] <= rr[0] {
-        found.push(doubt("the front wheels lie behind the rear ones".into(), "x points forward, and wheels are named FL, FR, RL, RR"));
-    } else if fl[0] <= 0.0 || rl[0] >= 0.0 {
-        let what = format!("the centre of gravity lies outside of the wheels (x of the axles {:.2} and {:.2} m)", fl[0], rl[0]);
-        found.push(doubt(what, "wheel centres are given relative to the centre of gravity"));
-    }
     let about = |what: &str, value: f64, range: [f64; 2], unit: &str| {
         let unit = if unit.is_empty() { String::new() } else { format!(" {unit}") };
         let text = format!("{what} is {value:.3}{unit}, off-road vehicles have {} to {}{unit}", range[0], range[1]);
@@ -59,11 +48,10 @@ pub fn card_doubts(vehicle: &Vehicle, mass_of_parts_kg: Option<f64>) -> Vec<Doub
         about("the radius of the wheels", radius_m, [0.05, 1.2], "m"),
         about("the width of the wheels", vehicle.wheel_width_m, [0.02, 1.2], "m"),
         about("the wheelbase", vehicle.wheelbase_m, [0.15, 8.0], "m"),
-        // A negative one was told as wheels on the wrong side.
-        about("the track", track_m.abs(), [0.1, 4.0], "m"),
+        about("the track", track_m, [0.1, 4.0], "m"),
     ];
     if sizes.iter().all(Option::is_none) {
-        found.extend(about("the track over the wheelbase", track_m.abs() / vehicle.wheelbase_m, TRACK_PER_WHEELBASE, ""));
+        found.extend(about("the track over the wheelbase", track_m / vehicle.wheelbase_m, TRACK_PER_WHEELBASE, ""));
         let [least, most] = MASS_PER_RADIUS_KG_M3.map(|density| density * radius_m.powi(3));
         if !(least..=most).contains(&mass_kg) {
             let what =

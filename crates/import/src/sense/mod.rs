@@ -5,9 +5,11 @@
 //! limits are wide (chosen): slip, lag and noise of a sound log stay inside, a wrong unit or sign does not. A check counts stretches of a second, and
 //! doubts what most of them say: one drive with a bad pose is none, and of few seconds nothing is said.
 
+mod belong;
 mod card;
 mod commands;
 mod heading;
+mod heights;
 mod late;
 mod motion;
 mod point;
@@ -50,6 +52,11 @@ fn doubt(what: String, advice: impl Into<String>) -> Doubt {
 
 /// What does not fit together in these drives of one vehicle, causes first. Nothing is said of what they hardly exercise, nor of what a wrong heading explains.
 pub fn doubts(drives: &[Trajectory], vehicle: &Vehicle) -> Vec<Doubt> {
+    let positions_m = drives.iter().flat_map(|drive| &drive.states).map(|state| state.position_m);
+    disagreements(drives, vehicle).into_iter().chain(positions::far_from_origin(positions_m)).collect()
+}
+
+fn disagreements(drives: &[Trajectory], vehicle: &Vehicle) -> Vec<Doubt> {
     // Whatever else is odd follows from attitudes that are none.
     if let Some(order) = quaternion::order(drives) {
         return vec![order];
@@ -58,6 +65,7 @@ pub fn doubts(drives: &[Trajectory], vehicle: &Vehicle) -> Vec<Doubt> {
     // Of positions that jump back and forth all the time, nothing follows.
     let torn = jumps.as_ref().is_some_and(|jumps| jumps.often && jumps.back_and_forth);
     let attitude: Vec<Doubt> = motion::tilt(drives).into_iter().chain(heading::heading(drives).filter(|_| !torn)).collect();
+    let heights = if jumps.is_none() { heights::heights(drives, vehicle) } else { None };
     // A path in another unit is all jumps, and told by the velocities.
     let (jumps, unit) =
         jumps.map_or((None, None), |found| if found.often && !torn { (None, Some(found.doubt)) } else { (Some(found.doubt), None) });
@@ -75,7 +83,7 @@ pub fn doubts(drives: &[Trajectory], vehicle: &Vehicle) -> Vec<Doubt> {
         found.extend(rims);
     }
     found.extend(rates);
-    found.extend(motion::climb(drives).filter(|_| !torn));
+    found.extend(motion::climb(drives).filter(|_| !torn && heights.is_none()));
     found.extend(commands::speed(drives, attitude_holds && !torn));
     found.extend(commands::turning(drives, vehicle));
     found.extend(road_wheels::angles(drives, vehicle));
@@ -89,8 +97,11 @@ pub fn doubts(drives: &[Trajectory], vehicle: &Vehicle) -> Vec<Doubt> {
     }
     found.extend(late);
     if found.is_empty() {
+        found.extend(belong::belong(drives, vehicle));
         found.extend(point::moves_sideways(drives, vehicle));
     }
+    // Nothing else is judged by them.
+    found.extend(heights);
     found
 }
 
@@ -110,6 +121,12 @@ fn ground_velocity_m_s(drive: &Trajectory, k: usize) -> [f64; 3] {
 fn forward_m_s(drive: &Trajectory, k: usize, [x, y, _]: [f64; 3]) -> f64 {
     let (sin, cos) = drive.states[k].attitude_rad[2].sin_cos();
     x * cos + y * sin
+}
+
+/// The same to the left of the heading, m/s.
+fn left_m_s(drive: &Trajectory, k: usize, [x, y, _]: [f64; 3]) -> f64 {
+    let (sin, cos) = drive.states[k].attitude_rad[2].sin_cos();
+    y * cos - x * sin
 }
 
 /// Rate of roll, pitch or yaw from the attitudes around a sample, rad/s.

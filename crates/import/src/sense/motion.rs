@@ -1,9 +1,9 @@
 //! Whether velocities, rates and tilt fit poses.
 
-use nesam_trajectories::{Trajectory, to_body};
+use nesam_trajectories::Trajectory;
 
 use super::relation::{ANGLES, Relation, SPEEDS, UNRELATED_ADVICE};
-use super::{Doubt, SPEED_M_S, YAW_RATE_RAD_S, angle_rate_rad_s, doubt, forward_m_s, measures_velocity};
+use super::{Doubt, SPEED_M_S, YAW_RATE_RAD_S, angle_rate_rad_s, doubt, forward_m_s, left_m_s, measures_velocity};
 
 /// Slopes between two measurements of the same that are let pass.
 const SAME: [f64; 2] = [0.7, 1.4];
@@ -43,7 +43,7 @@ pub(super) fn velocity(drives: &[Trajectory], positions_hold: bool) -> Option<Do
 /// Sideways velocities against positions: they are small, and only their sign can be told.
 pub(super) fn sideways(drives: &[Trajectory]) -> Option<Doubt> {
     let left = Relation::of(drives, SIDEWAYS_M_S, |drive, k, world| {
-        measures_velocity(drive).then(|| [to_body(drive.states[k].attitude_rad, world)[1], drive.states[k].velocity_m_s[1]])
+        measures_velocity(drive).then(|| [left_m_s(drive, k, world), drive.states[k].velocity_m_s[1]])
     });
     let (count, of) = left.reversed(SIDEWAYS_M_S)?;
     let what = format!("sideways velocity has the opposite sign of what positions say in {count} of {of} seconds");

@@ -1,10 +1,10 @@
 //! Which point of the vehicle positions are of.
 
 use nesam_physics::{SecondCommand, Vehicle};
-use nesam_trajectories::{Trajectory, to_body};
+use nesam_trajectories::Trajectory;
 
 use super::relation::means;
-use super::{Doubt, SPEED_M_S, YAW_RATE_RAD_S, doubt, forward_m_s};
+use super::{Doubt, SPEED_M_S, YAW_RATE_RAD_S, doubt, forward_m_s, left_m_s};
 
 /// Lateral acceleration up to which tyres hardly slide, m/s² (chosen: on soft soil of the simulator the point is found to a quarter of its distance).
 const SLOW_M_S2: f64 = 1.0;
@@ -21,7 +21,7 @@ pub(super) fn moves_sideways(drives: &[Trajectory], vehicle: &Vehicle) -> Option
         let state = &drive.states[k];
         let (forward_m_s, yaw_rate_rad_s) = (forward_m_s(drive, k, world), state.angular_velocity_rad_s[2]);
         let told = forward_m_s.abs() > SPEED_M_S && (forward_m_s * yaw_rate_rad_s).abs() < SLOW_M_S2;
-        told.then(|| [yaw_rate_rad_s, to_body(state.attitude_rad, world)[1]])
+        told.then(|| [yaw_rate_rad_s, left_m_s(drive, k, world)])
     });
     let ahead_m = |side: f64| {
         let turns = turning.iter().filter(|[rate, _]| side * rate >= YAW_RATE_RAD_S);

@@ -20,10 +20,29 @@ const BACK: f64 = 0.5;
 /// Share of the jumps after which positions come back, from which on they go to and fro (chosen): of single positions that mean none it is half.
 const TO_AND_FRO: f64 = 0.25;
 
-/// Samples without a break at one position, to the bit: sensors have noise, and one that repeats itself exactly has nothing new.
-fn stays(drive: &Trajectory) -> Vec<Range<usize>> {
+/// Coordinates beyond this are doubted, m: single precision has steps of 8 mm there (chosen).
+const FAR_M: f64 = 1e5;
+
+/// Positions so far from the origin that what the service answers, in single precision, is coarse.
+pub(super) fn far_from_origin(positions_m: impl Iterator<Item = [f64; 3]>) -> Option<Doubt> {
+    let farthest_m = positions_m.fold(0.0, |farthest: f64, [x, y, _]| farthest.max(x.abs()).max(y.abs()));
+    if farthest_m <= FAR_M {
+        return None;
+    }
+    let rounded = farthest_m as f32;
+    let step_m = f64::from(rounded.next_up()) - f64::from(rounded);
+    let what = format!("coordinates reach {:.0} km", farthest_m / 1e3);
+    let advice = format!(
+        "`nesam evaluate` scores them unrounded, but states that the service answers are f32, in steps of {step_m:.2} m there: give it poses and \
+         maps from an origin nearby"
+    );
+    Some(doubt(what, advice))
+}
+
+/// Samples without a break at one position in the first two or three axes, to the bit: sensors have noise, and one that repeats itself exactly has nothing new.
+fn stays(drive: &Trajectory, axes: usize) -> Vec<Range<usize>> {
     let mut begin = 0;
-    let stays = drive.states.chunk_by(|a, b| a.position_m[..2] == b.position_m[..2]).map(|stay| {
+    let stays = drive.states.chunk_by(|a, b| a.position_m[..axes] == b.position_m[..axes]).map(|stay| {
         begin += stay.len();
         begin - stay.len()..begin
     });
@@ -40,7 +59,7 @@ fn told_m_s(drive: &Trajectory, vehicle: &Vehicle, k: usize) -> Option<f64> {
 /// Positions that stay while the vehicle is said to move.
 pub(super) fn frozen(drives: &[Trajectory], vehicle: &Vehicle) -> Option<Doubt> {
     let longest_m = |drive: &Trajectory| {
-        let told = stays(drive).into_iter().map(|stay| {
+        let told = stays(drive, 2).into_iter().map(|stay| {
             let way_m = stay.clone().filter_map(|k| told_m_s(drive, vehicle, k)).sum::<f64>() * drive.dt_s;
             (way_m, stay.len() as f64 * drive.dt_s, drive.time_s[stay.start])
         });
@@ -68,11 +87,10 @@ pub(super) struct Jumps {
 
 /// Positions that no speed of the drive reaches.
 pub(super) fn jumps(drives: &[Trajectory], vehicle: &Vehicle) -> Option<Jumps> {
-    let found: Vec<Jump> = drives.iter().flat_map(|drive| jumps_of(drive, vehicle)).collect();
+    let found: Vec<Jump> = drives.iter().flat_map(|drive| jumps_of(drive, vehicle, Way::Horizontal)).collect();
     let steps: usize = drives.iter().map(|drive| drive.states.len()).sum();
     let Jump { drive, way_m, time_s, at_s, fastest_m_s, .. } = found.iter().max_by(|a, b| a.way_m.total_cmp(&b.way_m))?;
-    let (count, come_back) = (found.len(), found.iter().filter(|jump| jump.comes_back).count());
-    let back_and_forth = come_back as f64 >= TO_AND_FRO * count as f64;
+    let (count, back_and_forth) = (found.len(), back_and_forth(&found));
     let times = if back_and_forth { format!("back and forth, {count} times") } else { format!("{count} times") };
     let what = format!(
         "positions jump {times}: in `{drive}` by {way_m:.1} m within {time_s:.1} s at {at_s:.1} s, where no speed is above {fastest_m_s:.1} m/s"
@@ -85,23 +103,35 @@ pub(super) fn jumps(drives: &[Trajectory], vehicle: &Vehicle) -> Option<Jumps> {
     Some(Jumps { doubt: doubt(what, advice), often: count * JUMPS_ONE_IN > steps, back_and_forth })
 }
 
-struct Jump<'a> {
-    drive: &'a str,
-    way_m: f64,
-    time_s: f64,
-    at_s: f64,
-    fastest_m_s: f64,
+/// What of positions jumps.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(super) enum Way {
+    Horizontal,
+    Height,
+}
+
+pub(super) struct Jump<'a> {
+    pub(super) drive: &'a str,
+    pub(super) way_m: f64,
+    pub(super) time_s: f64,
+    pub(super) at_s: f64,
+    pub(super) fastest_m_s: f64,
     /// One of the next two positions lies near the one before.
     comes_back: bool,
 }
 
-fn jumps_of<'a>(drive: &'a Trajectory, vehicle: &Vehicle) -> Vec<Jump<'a>> {
+/// Whether positions go to and fro between jumps.
+pub(super) fn back_and_forth(jumps: &[Jump]) -> bool {
+    jumps.iter().filter(|jump| jump.comes_back).count() as f64 >= TO_AND_FRO * jumps.len() as f64
+}
+
+pub(super) fn jumps_of<'a>(drive: &'a Trajectory, vehicle: &Vehicle, way: Way) -> Vec<Jump<'a>> {
     let speeds = (0..drive.states.len()).map(|k| told_m_s(drive, vehicle, k).unwrap_or(0.0).max(drive.controls[k].speed_m_s.abs()));
     let fastest_m_s = speeds.fold(0.0, f64::max);
-    let stays = stays(drive);
+    let stays = stays(drive, if way == Way::Height { 3 } else { 2 });
     let way_m = |a: usize, b: usize| {
         let [a, b] = [a, b].map(|i| drive.states[stays[i].start].position_m);
-        (b[0] - a[0]).hypot(b[1] - a[1])
+        if way == Way::Height { (b[2] - a[2]).abs() } else { (b[0] - a[0]).hypot(b[1] - a[1]) }
     };
     let step = |i: usize| {
         let (way_m_of, time_s) = (way_m(i, i + 1), stays[i].len() as f64 * drive.dt_s);
@@ -117,4 +147,20 @@ fn jumps_of<'a>(drive: &'a Trajectory, vehicle: &Vehicle) -> Vec<Jump<'a>> {
         (way_m_of > FASTER * fastest_m_s * time_s + CORRECTION_M).then(jump)
     };
     (0..stays.len().saturating_sub(1)).filter_map(step).collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Goal: coordinates that the wire rounds are told of, with by how much. Method: the steps of f32 below 2^17 (1/128 m) and from 2^22 on (1/2 m).
+    #[test]
+    fn analytic_coordinates_beyond_single_precision_are_doubted() {
+        let doubt = |x_m: f64, y_m: f64| far_from_origin([[0.0; 3], [x_m, y_m, 1e6]].into_iter());
+        assert_eq!(doubt(-9.9e4, 9.9e4), None);
+        let local = doubt(-1.01e5, 0.0).expect("beyond");
+        assert!(local.what.contains("101 km") && local.advice.contains("steps of 0.01 m"), "{local:?}");
+        let utm = doubt(431_000.0, 4_583_000.0).expect("beyond");
+        assert!(utm.what.contains("4583 km") && utm.advice.contains("steps of 0.50 m"), "{utm:?}");
+    }
 }
