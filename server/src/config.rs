@@ -1,5 +1,6 @@
 //! The configuration. `deploy/config/default.toml` says the same with comments; a test keeps the two equal.
 
+mod check;
 mod cluster;
 mod diagnosis;
 mod ros2;
@@ -7,13 +8,12 @@ mod store;
 mod tls;
 mod zenoh;
 
-use std::net::{IpAddr, Ipv4Addr, SocketAddr};
+use std::net::{Ipv4Addr, SocketAddr};
 use std::path::{Path, PathBuf};
 
 use figment::Figment;
 use figment::providers::{Format, Serialized, Toml};
 use nesam_engine::{FleetSoilSettings, Limits};
-use nesam_model::MAX_HORIZON;
 use serde::{Deserialize, Serialize};
 
 pub use self::cluster::ClusterConfig;
@@ -22,14 +22,7 @@ pub use self::ros2::{Distribution, Ros2Config, Ros2Vehicle};
 pub use self::store::StoreConfig;
 pub use self::tls::TlsConfig;
 pub use self::zenoh::{ZenohConfig, ZenohMode, is_loopback_endpoint, is_tls_endpoint};
-use crate::convert::predict_bytes_max;
 use crate::error::ServerError;
-
-/// Most worker threads: more than processors of any one machine, and few enough to start.
-const THREADS_MAX: usize = 1024;
-
-/// Most connections, uploads, pages and measurements of a stream at a time: more than any machine bears, and few enough to count places for.
-const AT_A_TIME_MAX: usize = 1_000_000;
 
 /// Everything that can be configured. Unknown keys are refused.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
@@ -131,7 +124,7 @@ pub struct FleetSoilConfig {
     pub colour_reach: f64,
     /// Process noise, as share of the standard deviations of the prior.
     pub process_share: f64,
-    /// Cells held at most.
+    /// Cells held at most, own and told by others.
     pub cells_max: usize,
     /// Pause after which a server asks the others of the Zenoh network for all that was brought to them, s; 0 = servers do not share their maps.
     pub exchange_s: f64,
@@ -193,15 +186,10 @@ impl Default for FleetSoilConfig {
 }
 
 impl From<&FleetSoilConfig> for FleetSoilSettings {
-    fn from(c: &FleetSoilConfig) -> Self {
-        Self {
-            cell_m: c.cell_m,
-            half_life_s: c.half_life_s,
-            reach_m: c.reach_m,
-            colour_reach: c.colour_reach,
-            process_share: c.process_share,
-            cells_max: c.cells_max,
-        }
+    fn from(config: &FleetSoilConfig) -> Self {
+        // Whole, so that no setting is forgotten.
+        let FleetSoilConfig { enabled: _, exchange_s: _, cell_m, half_life_s, reach_m, colour_reach, process_share, cells_max } = *config;
+        Self { cell_m, half_life_s, reach_m, colour_reach, process_share, cells_max }
     }
 }
 
@@ -217,10 +205,7 @@ impl HttpConfig {
     /// # Errors
     /// `ServerError::Value` for something that is no address.
     pub fn health_address(&self) -> Result<Option<SocketAddr>, ServerError> {
-        let wrong = |error| ServerError::Value {
-            key: "http.health",
-            reason: format!("`{}`: {error}; expected for instance 0.0.0.0:50081", self.health),
-        };
+        let wrong = |error| ServerError::value("http.health", format!("`{}`: {error}; expected for instance 0.0.0.0:50081", self.health));
         Some(&self.health).filter(|text| !text.is_empty()).map(|text| text.parse().map_err(wrong)).transpose()
     }
 }
@@ -267,185 +252,6 @@ impl Config {
         config.http.listen = loopback(0);
         config.zenoh.enabled = false;
         config
-    }
-
-    /// Checks what the types do not.
-    ///
-    /// # Errors
-    /// `ServerError::Value` naming the key.
-    pub fn check(&self) -> Result<(), ServerError> {
-        self.check_numbers()?;
-        let reports = &self.http.reports;
-        if self.http.enabled && reports.exists() && !reports.is_dir() {
-            let reason = format!("{} is not a folder; give the one that `nesam diagnose` writes its reports to", reports.display());
-            return Err(ServerError::Value { key: "http.reports", reason });
-        }
-        self.check_ports()?;
-        self.tls.check()?;
-        self.zenoh.check()?;
-        let query_bytes = predict_bytes_max(&self.limits);
-        if self.zenoh.message_bytes_max < query_bytes {
-            let reason = format!("is {}, but a prediction within `limits` takes {query_bytes}", self.zenoh.message_bytes_max);
-            return Err(ServerError::Value { key: "zenoh.message_bytes_max", reason });
-        }
-        self.ros2.check()?;
-        if self.ros2.enabled && !self.zenoh.enabled {
-            let reason = "is on, but `zenoh.enabled` is off: machines of ROS 2 are heard over Zenoh".into();
-            return Err(ServerError::Value { key: "ros2.enabled", reason });
-        }
-        self.cluster.check()?;
-        self.diagnosis.check()?;
-        if self.cluster.enabled() && self.store.enabled {
-            let reason = "is on, but with `cluster.etcd` sessions are kept in etcd; choose one".into();
-            return Err(ServerError::Value { key: "store.enabled", reason });
-        }
-        if self.zenoh.uses_tls() && !self.tls.restricts() {
-            let reason = "has an endpoint `tls/...`, which needs certificates for both sides: set `tls.client_ca`".into();
-            return Err(ServerError::Value { key: "zenoh", reason });
-        }
-        self.check_side_doors()?;
-        FleetSoilSettings::from(&self.fleet_soil)
-            .check()
-            .map_err(|error| ServerError::Value { key: "fleet_soil", reason: error.to_string() })?;
-        Ok(())
-    }
-
-    /// Checks the range of each number by itself.
-    fn check_numbers(&self) -> Result<(), ServerError> {
-        let seconds = [
-            ("grpc.deadline_s", self.grpc.deadline_s),
-            ("grpc.upload_deadline_s", self.grpc.upload_deadline_s),
-            ("grpc.keepalive_s", self.grpc.keepalive_s),
-            ("grpc.drain_s", self.grpc.drain_s),
-            ("tls.handshake_s", self.tls.handshake_s),
-            ("tls.reload_s", self.tls.reload_s),
-            ("limits.pause_max_s", self.limits.pause_max_s),
-            ("limits.session_idle_s", self.limits.session_idle_s),
-            ("limits.clock_ahead_max_s", self.limits.clock_ahead_max_s),
-            ("store.interval_s", self.store.interval_s),
-            ("diagnosis.limit_s", self.diagnosis.limit_s),
-            ("zenoh.status_interval_s", self.zenoh.status_interval_s),
-            ("ros2.command_hold_s", self.ros2.command_hold_s),
-            ("ros2.diagnostics_interval_s", self.ros2.diagnostics_interval_s),
-        ];
-        for (key, value) in seconds {
-            if !(value > 0.0 && value <= 1e6) {
-                return Err(ServerError::Value { key, reason: format!("is {value}, allowed is above 0 and up to 1e6 s") });
-            }
-        }
-        let magnitudes = [
-            ("limits.position_max_m", self.limits.position_max_m),
-            ("limits.speed_max_m_s", self.limits.speed_max_m_s),
-            ("limits.angular_speed_max_rad_s", self.limits.angular_speed_max_rad_s),
-        ];
-        for (key, value) in magnitudes {
-            if !(value > 0.0 && value.is_finite()) {
-                return Err(ServerError::Value { key, reason: format!("is {value}, allowed is a finite number above 0") });
-            }
-        }
-        if self.workers.threads > THREADS_MAX {
-            let reason = format!("is {}, at most {THREADS_MAX} are allowed", self.workers.threads);
-            return Err(ServerError::Value { key: "workers.threads", reason });
-        }
-        let counts = [
-            ("grpc.uploads_max", self.grpc.uploads_max),
-            ("grpc.tile_bytes_max", self.grpc.tile_bytes_max),
-            ("grpc.measurements_in_flight_max", self.grpc.measurements_in_flight_max),
-            ("grpc.connections_max", self.grpc.connections_max),
-            ("grpc.streams_per_connection_max", self.grpc.streams_per_connection_max as usize),
-            ("http.watchers_max", self.http.watchers_max),
-            ("limits.sessions_max", self.limits.sessions_max),
-            ("limits.sessions_per_vehicle_max", self.limits.sessions_per_vehicle_max),
-            ("limits.samples_max", self.limits.samples_max),
-            ("limits.horizon_max", self.limits.horizon_max),
-            ("limits.sample_steps_max", self.limits.sample_steps_max),
-            ("limits.waiting_predictions_max", self.limits.waiting_predictions_max),
-            ("limits.waiting_predictions_per_vehicle_max", self.limits.waiting_predictions_per_vehicle_max),
-            ("limits.waiting_commands_max", self.limits.waiting_commands_max),
-            ("limits.waiting_measurements_per_vehicle_max", self.limits.waiting_measurements_per_vehicle_max),
-            ("recording.part_bytes_max", usize::from(self.recording.part_bytes_max > 0)),
-            ("recording.bytes_max", usize::from(self.recording.bytes_max > 0)),
-            ("recording.queue_bytes_max", usize::from(self.recording.queue_bytes_max > 0)),
-        ];
-        for (key, value) in counts {
-            if value == 0 {
-                return Err(ServerError::Value { key, reason: "is 0, at least 1 is needed".into() });
-            }
-        }
-        let at_a_time = [
-            ("grpc.uploads_max", self.grpc.uploads_max),
-            ("grpc.connections_max", self.grpc.connections_max),
-            ("grpc.measurements_in_flight_max", self.grpc.measurements_in_flight_max),
-            ("http.watchers_max", self.http.watchers_max),
-        ];
-        for (key, value) in at_a_time {
-            if value > AT_A_TIME_MAX {
-                return Err(ServerError::Value { key, reason: format!("is {value}, at most {AT_A_TIME_MAX} are allowed") });
-            }
-        }
-        if self.limits.horizon_max > MAX_HORIZON {
-            let reason = format!("is {}, the model predicts {MAX_HORIZON} steps at most", self.limits.horizon_max);
-            return Err(ServerError::Value { key: "limits.horizon_max", reason });
-        }
-        if !(self.fleet_soil.exchange_s >= 0.0 && self.fleet_soil.exchange_s <= 1e6) {
-            let reason = format!("is {}, allowed is 0 (off) up to 1e6 s", self.fleet_soil.exchange_s);
-            return Err(ServerError::Value { key: "fleet_soil.exchange_s", reason });
-        }
-        let window_s = self.limits.reorder_window_s;
-        if !(0.0..=1.0).contains(&window_s) {
-            return Err(ServerError::Value { key: "limits.reorder_window_s", reason: format!("is {window_s}, allowed is 0 to 1 s") });
-        }
-        Ok(())
-    }
-
-    /// Addresses that the server listens on itself, with their keys.
-    ///
-    /// # Errors
-    /// `ServerError::Value` as [`HttpConfig::health_address`].
-    pub fn addresses(&self) -> Result<Vec<(&'static str, SocketAddr)>, ServerError> {
-        let http = self.http.enabled.then_some(("http.listen", self.http.listen));
-        let health = self.http.health_address()?.map(|address| ("http.health", address));
-        let zenoh = self.zenoh.listen.iter().filter(|_| self.zenoh.enabled).filter_map(|endpoint| zenoh::socket(endpoint));
-        let zenoh = zenoh.map(|address| ("zenoh.listen", address));
-        Ok([("grpc.listen", self.grpc.listen)].into_iter().chain(http).chain(health).chain(zenoh).collect())
-    }
-
-    /// No two listeners may want the same port.
-    fn check_ports(&self) -> Result<(), ServerError> {
-        // All addresses of IPv6 are those of IPv4 too.
-        let covers = |a: IpAddr, b: IpAddr| a == b || (a.is_unspecified() && (a.is_ipv6() || b.is_ipv4()));
-        let addresses = self.addresses()?;
-        for (i, (key, address)) in addresses.iter().enumerate().filter(|(_, (_, address))| address.port() != 0) {
-            let same = |other: &SocketAddr| {
-                other.port() == address.port() && (covers(other.ip(), address.ip()) || covers(address.ip(), other.ip()))
-            };
-            if let Some((taken_by, _)) = addresses[..i].iter().find(|(_, other)| same(other)) {
-                let reason = format!("is {address}, whose port `{taken_by}` has already");
-                return Err(ServerError::Value { key, reason });
-            }
-        }
-        Ok(())
-    }
-
-    /// Where clients have to say who they are, nothing else that knows no identities may be open to the network.
-    fn check_side_doors(&self) -> Result<(), ServerError> {
-        if !self.tls.restricts() {
-            return Ok(());
-        }
-        if self.http.enabled && !self.http.listen.ip().is_loopback() {
-            let reason = "is open to the network and knows no identities; with `tls.client_ca` only loopback is allowed".into();
-            return Err(ServerError::Value { key: "http.listen", reason });
-        }
-        if self.zenoh.enabled
-            && let Some(endpoint) = self.zenoh.listen.iter().find(|endpoint| !is_loopback_endpoint(endpoint) && !is_tls_endpoint(endpoint))
-        {
-            let reason = format!(
-                "`{endpoint}` is open to the network and knows no identities; with `tls.client_ca` listen on `tls/...`, or on loopback only \
-                 behind a router (`nesam router-config` writes its configuration)"
-            );
-            return Err(ServerError::Value { key: "zenoh.listen", reason });
-        }
-        Ok(())
     }
 }
 

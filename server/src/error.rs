@@ -76,3 +76,10 @@ pub enum ServerError {
         reason: String,
     },
 }
+
+impl ServerError {
+    /// A configured value that makes no sense.
+    pub(crate) fn value(key: &'static str, reason: impl Into<String>) -> Self {
+        Self::Value { key, reason: reason.into() }
+    }
+}

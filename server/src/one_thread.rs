@@ -53,7 +53,7 @@ where
     let (events, _) = broadcast::channel(EVENTS_KEPT);
     let (metrics, access) = (Arc::new(Metrics::default()), Access::default());
     let keeper = Arc::new(Keeper::new(Duration::from_secs_f64(config.store.interval_s)));
-    let (live, _) = Live::new(&config.http);
+    let (live, _) = Live::new(&config);
     let sink = event_sink(events.clone(), metrics.clone(), Some(keeper.clone()), access.directory.clone(), live.feed);
     let handle = EngineHandle::unthreaded(engine_of(&config, &predictor, sink)?, Arc::new(MonotonicClock::default()), None);
     let engine = EngineClient::new(handle.clone(), metrics, access.directory.clone());

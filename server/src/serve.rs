@@ -10,7 +10,7 @@ use std::time::Duration;
 use nesam_engine::{Clock as _, Engine, EngineHandle, Event, EventSink, Tap};
 use nesam_model::Predictor;
 use nesam_proto::v1 as pb;
-use tokio::net::TcpListener;
+use tokio::net::{TcpListener, TcpSocket};
 use tokio::sync::{broadcast, watch};
 use tokio::task::JoinHandle;
 use tonic::transport::server::Router;
@@ -43,6 +43,8 @@ pub(crate) const EVENTS_KEPT: usize = 1024;
 /// Connections of HTTP at a time, beside those of live pages (chosen: an orchestrator and a few proxies ask one at a time each). More would take the file
 /// descriptors of gRPC.
 const ASKERS_MAX: usize = 64;
+/// Connections that wait to be accepted; what is beyond waits a second and more before it tries again. A whole fleet comes at once after a restart.
+const ARRIVALS: u32 = 1024;
 /// Connections that a browser opens to one server.
 const BROWSER_CONNECTIONS: usize = 6;
 /// Longest wait at shutdown for the store, and for the recording: a disk that hangs must not keep the process (chosen: both after the usual `grpc.drain_s` within
@@ -88,7 +90,7 @@ pub async fn serve(config: Config, predictor: Arc<Predictor>) -> Result<RunningS
     let (tls, access) = access::load(&config.tls)?;
     let tls = tls.map(|tls| tls.on_zenoh(config.zenoh.uses_tls()));
     // Everything that can fail for want of an address comes before the first thread.
-    let sockets = Sockets::bind(&config).await?;
+    let sockets = Sockets::bind(&config)?;
     let grpc_addr = local(&sockets.grpc, config.grpc.listen);
     let http_addr = sockets.http.as_ref().map(|listener| local(listener, config.http.listen));
     let health_addr = sockets.health.as_ref().and_then(|listener| listener.local_addr().ok());
@@ -98,7 +100,7 @@ pub async fn serve(config: Config, predictor: Arc<Predictor>) -> Result<RunningS
     // This life of the server, which those who hear from it tell from others.
     let run = unix_ns().unsigned_abs();
     let keeper = (config.store.enabled || config.cluster.enabled()).then(|| Arc::new(keeper_of(&config, &predictor, run)));
-    let (live, passed) = Live::new(&config.http);
+    let (live, passed) = Live::new(&config);
     let sink = event_sink(events.clone(), metrics.clone(), keeper.clone(), access.directory.clone(), live.feed.clone());
     let engine = engine_of(&config, &predictor, sink)?;
     let clock = MonotonicClock::default();
@@ -155,7 +157,7 @@ pub async fn serve(config: Config, predictor: Arc<Predictor>) -> Result<RunningS
         tokio::spawn(files.follow(reload_every, metrics.clone(), stopping.clone()));
     }
     if let Some(keeper) = &keeper {
-        tokio::spawn(tell_stalls(keeper.clone(), store_interval, stopping.clone()));
+        tokio::spawn(tell_stalls(keeper.clone(), store_interval, live.feed.clone(), stopping.clone()));
     }
     let health = Health::start(cluster.clone()).await;
     let secure = match (edge.access.is_restricted(), &tls) {
@@ -200,7 +202,7 @@ pub(crate) fn engine_of(config: &Config, predictor: &Arc<Predictor>, sink: Event
         true => engine.with_fleet_soil((&config.fleet_soil).into()),
         false => Ok(engine),
     };
-    Ok(engine.map_err(|error| ServerError::Value { key: "fleet_soil", reason: error.to_string() })?.with_events(sink))
+    Ok(engine.map_err(|error| ServerError::value("fleet_soil", error.to_string()))?.with_events(sink))
 }
 
 /// The recording that the configuration asks for, and the tap that feeds it.
@@ -320,22 +322,29 @@ struct Sockets {
 }
 
 impl Sockets {
-    async fn bind(config: &Config) -> Result<Self, ServerError> {
-        let grpc = listen(config.grpc.listen, "grpc.listen").await?;
+    fn bind(config: &Config) -> Result<Self, ServerError> {
+        let grpc = listen(config.grpc.listen, "grpc.listen")?;
         let http = match config.http.enabled {
-            true => Some(listen(config.http.listen, "http.listen").await?),
+            true => Some(listen(config.http.listen, "http.listen")?),
             false => None,
         };
         let health = match config.http.health_address()? {
-            Some(address) => Some(listen(address, "http.health").await?),
+            Some(address) => Some(listen(address, "http.health")?),
             None => None,
         };
         Ok(Self { grpc, http, health })
     }
 }
 
-async fn listen(address: SocketAddr, key: &'static str) -> Result<TcpListener, ServerError> {
-    TcpListener::bind(address).await.map_err(|source| ServerError::Listen { address, key, source })
+fn listen(address: SocketAddr, key: &'static str) -> Result<TcpListener, ServerError> {
+    let listening = || {
+        let socket = if address.is_ipv4() { TcpSocket::new_v4() } else { TcpSocket::new_v6() }?;
+        // A server that starts again does not wait for the connections of the one before.
+        socket.set_reuseaddr(true)?;
+        socket.bind(address)?;
+        socket.listen(ARRIVALS)
+    };
+    listening().map_err(|source| ServerError::Listen { address, key, source })
 }
 
 fn local(listener: &TcpListener, asked: SocketAddr) -> SocketAddr {

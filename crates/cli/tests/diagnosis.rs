@@ -145,11 +145,18 @@ async fn service_a_diagnosis_of_what_is_being_recorded_names_the_effect() {
     assert!(folder.starts_with(here.path().canonicalize().unwrap()) || folder.starts_with(here.path()), "{folder:?}");
     assert!(folder.join("diagnose.html").is_file() && Path::new(&report.bundle).join("manifest.toml").is_file());
     assert!(report.bundle_hash.len() == 64 && json["provenance"]["bundle_hash"] != report.bundle_hash.as_str());
-    assert_eq!(report.notes, Vec::<String>::new(), "the bundle is that of the recording");
+    // The bundle is that of the recording, of which there is nothing to say.
+    let [of_pieces] = report.notes.as_slice() else { panic!("{:?}", report.notes) };
+    assert!(of_pieces.contains("5 pieces of one recording") && json["notes"][0] == of_pieces.as_str(), "{of_pieces}");
 
     // What was found can be applied as it came, and taken away.
     let applied = client.apply_effects("truck", &report.diagnosis_id, report.effects.clone()).await.unwrap();
     assert_eq!((applied.effects, applied.effects_source), (report.effects.clone(), report.diagnosis_id.clone()));
+    // What acts is said, and measured against the bundle alone: the same is found.
+    let (events, _) = heard(&mut client, asked("truck")).await;
+    let Some(Event::Report(again)) = events.last() else { panic!("{events:?}") };
+    assert_eq!(again.effects[0].id, "velocity_scale");
+    assert!(again.notes.iter().any(|note| note.contains("predicts with velocity_scale:relative=")), "{:?}", again.notes);
     assert_eq!(client.revert_effects("truck").await.unwrap().effects, []);
 
     // A drive without a map is judged in what it has.

@@ -392,7 +392,8 @@ fn held_against<'a>(
         let mut ground_alone = None;
         if asked.fit_maps.iter().all(Option::is_none) {
             let plain_predictor = plain;
-            let plain = Bench { vehicle: &plain.bundle().vehicle, ..bench };
+            let bundle = plain.bundle();
+            let plain = Bench { vehicle: &bundle.vehicle, effects: &bundle.effects, ..bench };
             let drives: Vec<&ObservedDrive> = observed.iter().collect();
             let work = Work::begin("drives predicted on another soil", progress);
             let trial = Trial {

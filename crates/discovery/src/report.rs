@@ -36,6 +36,8 @@ pub struct Report<'a> {
     pub against: Against,
     /// What does not fit together in the drives themselves, by which a claim may be wrong: units, signs, frames.
     pub doubts: &'a [String],
+    /// What else to know of the drives.
+    pub notes: &'a [String],
 }
 
 impl Report<'_> {
@@ -70,6 +72,7 @@ impl Report<'_> {
             "stop_rule": STOP_RULE,
             "reference": match self.against { Against::Bundle => "bundle", Against::Physics => "physics" },
             "doubts": self.doubts,
+            "notes": self.notes,
             "provenance": self.provenance,
         });
         let map = document.as_object_mut().expect("an object was built; this is a bug");
@@ -197,15 +200,15 @@ impl Report<'_> {
     /// The page.
     pub fn to_html(&self) -> String {
         let d = self.diagnosis;
-        let lead = format!(
-            "Verdict on set {}: {} - {}. Fitted on {} drives, scored on {} that were not fitted.",
-            self.set,
-            d.verdict.as_str(),
-            d.reason,
-            d.fit_on.len(),
-            d.held_out.len()
-        );
+        let scored = match d.held_out.len() {
+            held_out if d.held_out == d.fit_on => format!("Each of {held_out} drives is scored with what the others taught."),
+            held_out => format!("Fitted on {} drives, scored on {held_out} that were not fitted.", d.fit_on.len()),
+        };
+        let lead = format!("Verdict on set {}: {} - {}. {scored}", self.set, d.verdict.as_str(), d.reason);
         let mut page = Page::new(&format!("nesam diagnose: {}", self.set), &lead);
+        for note in self.notes {
+            page.text(note);
+        }
         if !self.doubts.is_empty() {
             page.section("What does not fit together in the drives")
                 .text("A claim may be wrong by this: mend the log first, and see what `nesam check` says of it.");
@@ -231,6 +234,9 @@ impl Report<'_> {
                 d.selection.threshold
             ))
             .table(&self.hypothesis_table());
+        for apart in d.findings.iter().filter(|finding| finding.refused.is_none()).filter_map(to_tell_apart) {
+            page.text(&apart);
+        }
         if !d.estimates.is_empty() && d.verdict.claims() {
             page.section("What was added").table(&self.estimate_table());
         }
@@ -335,10 +341,13 @@ impl Report<'_> {
     }
 
     fn estimate_table(&self) -> Table {
-        let mut table = Table::new("Parameters with 95 % intervals", &["parameter", "value", "interval", "unit"]);
-        for e in &self.diagnosis.estimates {
-            let interval = e.ci95.map_or("-".into(), |[l, h]| format!("[{}, {}]", Short(l), Short(h)));
-            table.row(vec![e.name.into(), Short(e.value).to_string().into(), interval.into(), e.unit.into()]);
+        let mut table = Table::new("Parameters with 95 % intervals", &["effect", "parameter", "value", "interval", "unit"]);
+        for finding in self.diagnosis.findings.iter().filter(|finding| finding.refused.is_none()) {
+            for e in &finding.estimates {
+                let interval = e.ci95.map_or("-".into(), |[l, h]| format!("[{}, {}]", Short(l), Short(h)));
+                let label = finding.candidate.label();
+                table.row(vec![label.into(), e.name.into(), Short(e.value).to_string().into(), interval.into(), e.unit.into()]);
+            }
         }
         table
     }
@@ -425,6 +434,12 @@ fn trace_plot(trace: &Trace) -> LinePlot {
         plot.series.push(Series::line("with the effects", 3, trace.after.clone()));
     }
     plot
+}
+
+/// What to drive so that an effect and its closest rival come apart, in words; `None` without a rival.
+pub fn to_tell_apart(finding: &Finding) -> Option<String> {
+    let (rival, manoeuvre) = (finding.rivals.first()?, manoeuvre::separating(finding)?);
+    Some(format!("to tell {} from {}: {manoeuvre}", finding.candidate.label(), rival.candidate.label()))
 }
 
 /// An effect in words.
@@ -519,11 +534,13 @@ mod tests {
             dt_s: 0.1,
             against: Against::Bundle,
             doubts: &["yaw counts like a compass".into()],
+            notes: &["pieces of one recording".into()],
         };
         let json: Value = serde_json::from_str(&report.to_json()).unwrap();
         let without_numbers = json!(ErrorSummary::default());
         assert_eq!(json["doubts"][0], "yaw counts like a compass");
         assert!(report.to_html().contains("<p>yaw counts like a compass</p>"));
+        assert!(json["notes"][0] == "pieces of one recording" && report.to_html().contains("<p>pieces of one recording</p>"));
         assert_eq!(without_numbers["windows"], 0);
         for errors in [&json["before"], &json["soil_only"], &json["after"], &json["controls"]["black_box_refit"]] {
             assert_eq!(errors, &without_numbers);

@@ -33,6 +33,7 @@ fn report(root: &Path) -> String {
         dt_s: 0.1,
         against: Default::default(),
         doubts: &[],
+        notes: &[],
     }
     .to_json()
 }

@@ -317,6 +317,7 @@ fn property_without_a_claim_the_free_form_stands_against_the_model_as_it_is() {
         dt_s: 0.1,
         against,
         doubts: &[],
+        notes: &[],
     };
     let json: serde_json::Value = serde_json::from_str(&report.to_json()).unwrap();
     assert_eq!(json["controls"]["free_form"]["before"], json["before"]);
@@ -510,6 +511,36 @@ fn property_the_network_is_heard_over_the_ground_of_an_effect() {
     };
     let left = [0.02, 0.002].map(left);
     assert!(left.iter().all(|left| *left < 0.05), "{left:?}");
+}
+
+/// Goal: effects that a bundle has from an onset on are known as such, so that the drives that taught them say nothing more. Method: each kind of effect in the bundle,
+/// and beside a bundle without it.
+#[test]
+fn property_effects_of_a_bundle_begin_when_they_begin() {
+    let (bundle, recorded, observed) = observed_drive("late");
+    let plain = Bench::new(&bundle, &[]);
+    let onset_s = observed.times_s(plain.stepping.dt_s)[10];
+    let effects = [
+        Effect::SteeringLag(SteeringLag { seconds: 0.3 }),
+        Effect::GyroBias(GyroBias { rad_s: 0.02 }),
+        Effect::WheelDrag(WheelDrag { wheel: 3, torque_n_m: 900.0 }),
+    ];
+    for effect in effects {
+        let late = ScheduledEffect { effect, onset_s };
+        let patched = bundle.with_effects(&[late]);
+        let predictor = nesam_model::Predictor::new(std::sync::Arc::new(patched.clone())).unwrap();
+        let again = observe(&predictor, &recorded, Some(&world())).unwrap();
+        let rows = again.deviations(&Bench::new(&patched, &[]), &[], &SoilCorrection::NONE);
+        let beside = observed.deviations(&plain, &[late], &SoilCorrection::NONE);
+        let always = observed.deviations(&plain, &[ScheduledEffect { effect, onset_s: 0.0 }], &SoilCorrection::NONE);
+        let apart = |a: &[Row], b: &[Row]| a.iter().flatten().zip(b.iter().flatten()).map(|(a, b)| (a - b).abs()).fold(0.0, f64::max);
+        assert!(
+            apart(&rows, &beside) < 1e-9 && apart(&rows, &always) > 1e-4,
+            "{effect:?}: {} {}",
+            apart(&rows, &beside),
+            apart(&rows, &always)
+        );
+    }
 }
 
 /// Goal: actuators remember a vehicle that did not have an effect yet. Method: a steering lag from the eleventh segment on and one from the start. Segments before it are

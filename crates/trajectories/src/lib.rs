@@ -38,7 +38,7 @@ pub use error::TrajectoryError;
 pub use ground_truth::GroundTruth;
 pub use limited_start::limited_starts;
 pub use recorded::Recorded;
-pub use reports::{Report, drives_of_reports};
+pub use reports::{Report, drives_of_reports, has_a_piece};
 pub use resample::{STEP_MAX_S, gap_limit_s};
 pub use soil_truth::{RegionSoil, SoilTruth, read_ground_truth_soil};
 pub use trajectory::{MeasuredChannels, Split, Trajectory, VelocitySource};

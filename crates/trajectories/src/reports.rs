@@ -31,8 +31,7 @@ pub struct Report {
 /// Pieces of one drive share its ground and its driver: they are less independent of each other than drives are, and what is concluded from their scatter
 /// is surer of itself than it should be.
 pub fn drives_of_reports(id: &str, reports: &[Report], dt_s: f64, pieces: usize) -> Vec<Trajectory> {
-    let stretches: Vec<&[Report]> =
-        reports.chunk_by(|a, b| b.time_s > a.time_s && b.time_s - a.time_s <= PAUSE_S).filter(|s| length_s(s) >= PIECE_MIN_S).collect();
+    let stretches: Vec<&[Report]> = stretches(reports).collect();
     let total_s: f64 = stretches.iter().map(|s| length_s(s)).sum();
     let piece_s = (total_s / pieces.max(1) as f64).max(PIECE_MIN_S);
     let mut drives = Vec::new();
@@ -48,6 +47,16 @@ pub fn drives_of_reports(id: &str, reports: &[Report], dt_s: f64, pieces: usize)
         }
     }
     drives
+}
+
+/// Whether [`drives_of_reports`] has something to cut: a stretch of 4 s.
+pub fn has_a_piece(reports: &[Report]) -> bool {
+    stretches(reports).next().is_some()
+}
+
+/// What lies between pauses and steps back of the clock and is long enough.
+fn stretches(reports: &[Report]) -> impl Iterator<Item = &[Report]> {
+    reports.chunk_by(|a, b| b.time_s > a.time_s && b.time_s - a.time_s <= PAUSE_S).filter(|stretch| length_s(stretch) >= PIECE_MIN_S)
 }
 
 fn length_s(reports: &[Report]) -> f64 {

@@ -140,7 +140,7 @@ pub struct StartDiagnosisRequest {
     #[prost(string, tag = "1")]
     pub session_id: ::prost::alloc::string::String,
     /// Recording to read, by the name of its run: that of its files without `.<part>.mcap`, for instance `nesam-20260131T120000Z-17`. Empty = what this server has
-    /// recorded until now.
+    /// recorded until now; a window from a stamp on that is not in it is looked for in its runs before.
     #[prost(string, tag = "2")]
     pub recording: ::prost::alloc::string::String,
     /// First and last stamp of the window, ns of the vehicle's clock; absent = from the first, to the last. An alarm tells its `onset_stamp_ns`.

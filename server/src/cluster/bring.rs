@@ -3,7 +3,7 @@
 use std::sync::Arc;
 use std::time::Duration;
 
-use nesam_engine::{EngineError, SessionImage};
+use nesam_engine::{EngineError, SessionImage, check_name};
 use nesam_proto::etcd::KeyValue;
 use tokio::runtime::Handle;
 use tokio::sync::OwnedMutexGuard;
@@ -15,6 +15,8 @@ use super::{Claim, Cluster, ENGINE_WAIT, Held, NO_TURN, Stage, again, created, d
 use crate::convert::to_status;
 use crate::store::{StoredSession, resumed};
 
+/// Sessions that are brought here at a time for a bus; each holds a message of it meanwhile.
+const TURNS_MAX: usize = 1024;
 /// Longest wait for an owner that is gone or slow, however long the client would wait.
 const WAIT_MAX: Duration = Duration::from_secs(10);
 /// Longest pause between two looks at etcd; the watch usually tells sooner.
@@ -96,6 +98,11 @@ impl Drop for Asked {
     }
 }
 
+/// Whether no session can have this name: nothing is remembered of it and etcd is not asked.
+fn is_nowhere(session: &str) -> bool {
+    check_name("session_id", session).is_err()
+}
+
 impl Cluster {
     /// Brings a session here, wherever it is. `permit` hears the vehicle that it belongs to before anything is done.
     ///
@@ -126,6 +133,9 @@ impl Cluster {
         if self.is_elsewhere(session) {
             return Standing::Elsewhere;
         }
+        if is_nowhere(session) {
+            return Standing::Lost;
+        }
         let now = Instant::now();
         let mut state = self.lock();
         state.looked.retain(|_, at| now.duration_since(*at) < SEARCH_PAUSE);
@@ -136,8 +146,12 @@ impl Cluster {
         Standing::Lost
     }
 
-    /// Brings a session of this vehicle here if no server has it; `None` = another one was quicker, it is another vehicle's, or etcd does not answer.
+    /// Brings a session of this vehicle here if no server has it; `None` = another one was quicker, it is another vehicle's, etcd does not answer, or too many
+    /// are being brought: whoever measures or asks does so again.
     pub async fn search(&self, session: &str, vehicle: &str, budget: Duration) -> Option<Brought> {
+        if self.lock().turns.len() >= TURNS_MAX {
+            return None;
+        }
         let own = |of: &str| if of == vehicle { Ok(()) } else { Err(Status::permission_denied("of another vehicle")) };
         self.have(session, Zeal::IfFree, budget, own).await.ok()
     }
@@ -149,6 +163,9 @@ impl Cluster {
         budget: Duration,
         permit: impl Fn(&str) -> Result<(), Status>,
     ) -> Result<Brought, Status> {
+        if is_nowhere(session) {
+            return Ok(Brought::Nowhere);
+        }
         let now = Instant::now();
         let until = now + budget.min(WAIT_MAX);
         // Without a lease nothing can be said. It may come back; a refusal at once would only bring the client back to this server. Once a proxy that watches

@@ -149,7 +149,7 @@ async fn within<T>(limit: Duration, asked: impl Future<Output = Result<T, Status
 /// # Errors
 /// `ServerError::Value` for an address that is none.
 pub(super) fn plain_endpoint(address: &str) -> Result<Endpoint, ServerError> {
-    let wrong = |error| ServerError::Value { key: "cluster.etcd", reason: format!("`{address}`: {error}") };
+    let wrong = |error| ServerError::value("cluster.etcd", format!("`{address}`: {error}"));
     let endpoint = Endpoint::from_shared(address.to_string()).map_err(|error| wrong(error.to_string()))?;
     Ok(endpoint
         .connect_timeout(CONNECT)

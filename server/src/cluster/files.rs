@@ -60,8 +60,7 @@ impl Files {
         if !self.certificate.is_empty() {
             tls = tls.identity(Identity::from_pem(&self.certificate, &self.key));
         }
-        let wrong =
-            |error: tonic::transport::Error| ServerError::Value { key: "cluster", reason: format!("`{address}`: {}", in_short(&error)) };
+        let wrong = |error: tonic::transport::Error| ServerError::value("cluster", format!("`{address}`: {}", in_short(&error)));
         endpoint.tls_config(tls).map_err(wrong)
     }
 

@@ -211,8 +211,10 @@ impl Cluster {
             if begun.elapsed() > FIRST_LEASE {
                 cluster.stop().await;
                 let trouble = cluster.0.lease.trouble().unwrap_or_else(|| "no answer".into());
-                let reason = format!("{}: no lease within {} s ({trouble}); is etcd there?", config.etcd.join(", "), FIRST_LEASE.as_secs());
-                return Err(ServerError::Value { key: "cluster.etcd", reason });
+                return Err(ServerError::value(
+                    "cluster.etcd",
+                    format!("{}: no lease within {} s ({trouble}); is etcd there?", config.etcd.join(", "), FIRST_LEASE.as_secs()),
+                ));
             }
             tokio::time::sleep(Duration::from_millis(10)).await;
         }

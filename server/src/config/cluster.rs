@@ -49,7 +49,7 @@ impl ClusterConfig {
     /// # Errors
     /// `ServerError::Value` naming the key.
     pub fn check(&self) -> Result<(), ServerError> {
-        let wrong = |key, reason: String| Err(ServerError::Value { key, reason });
+        let wrong = |key, reason: String| Err(ServerError::value(key, reason));
         if let Some(other) = self.etcd.iter().find(|address| !address.starts_with("http://") && !address.starts_with("https://")) {
             return wrong("cluster.etcd", format!("`{other}` is no address; expected `http://host:2379` or `https://host:2379`"));
         }

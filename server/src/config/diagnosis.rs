@@ -4,7 +4,7 @@ use std::path::PathBuf;
 
 use serde::{Deserialize, Serialize};
 
-use super::THREADS_MAX;
+use super::check::THREADS_MAX;
 use crate::error::ServerError;
 
 /// Diagnoses of what was recorded, each in a process of its own.
@@ -49,7 +49,7 @@ impl DiagnosisConfig {
             }
         }
         if self.kept_max == 0 {
-            return Err(ServerError::Value { key: "diagnosis.kept_max", reason: "is 0, at least 1 is needed".into() });
+            return Err(ServerError::value("diagnosis.kept_max", "is 0, at least 1 is needed"));
         }
         Ok(())
     }

@@ -1,7 +1,7 @@
 //! Machines that speak ROS 2.
 
 use nesam_engine::{EngineError, check_name};
-use nesam_physics::{SecondCommand, Vehicle};
+use nesam_physics::{POINT_MAX_M, SecondCommand, Vehicle};
 use nesam_ros2::graph::{self, Domain};
 use nesam_ros2::messages::CommandType;
 use serde::{Deserialize, Serialize};
@@ -10,8 +10,6 @@ use crate::error::ServerError;
 
 /// Highest `ROS_DOMAIN_ID` that ROS 2 takes.
 const DOMAIN_MAX: u32 = 232;
-/// Offset of a reference point beyond which it is not on the vehicle, m.
-const REFERENCE_MAX_M: f64 = 20.0;
 
 /// How a distribution of ROS 2 writes keys.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
@@ -137,7 +135,7 @@ impl Ros2Vehicle {
 
 /// Something is wrong with the machines.
 fn wrong(reason: String) -> ServerError {
-    ServerError::Value { key: "ros2.vehicles", reason }
+    ServerError::value("ros2.vehicles", reason)
 }
 
 impl Ros2Config {
@@ -174,10 +172,9 @@ impl Ros2Config {
     /// `ServerError::Value` naming the key.
     pub(super) fn check(&self) -> Result<(), ServerError> {
         if self.domain > DOMAIN_MAX {
-            let reason = format!("is {}, ROS 2 has domains 0 to {DOMAIN_MAX}", self.domain);
-            return Err(ServerError::Value { key: "ros2.domain", reason });
+            return Err(ServerError::value("ros2.domain", format!("is {}, ROS 2 has domains 0 to {DOMAIN_MAX}", self.domain)));
         }
-        graph::check_name(&self.node).map_err(|reason| ServerError::Value { key: "ros2.node", reason })?;
+        graph::check_name(&self.node).map_err(|reason| ServerError::value("ros2.node", reason))?;
         let mut topics: Vec<String> = Vec::new();
         for (i, machine) in self.vehicles.iter().enumerate() {
             check_name("vehicle", &machine.vehicle).map_err(|error: EngineError| wrong(format!("entry {}: {error}", i + 1)))?;
@@ -194,8 +191,8 @@ impl Ros2Config {
                 }
                 topics.push(topic);
             }
-            if !machine.reference_m.iter().all(|m| m.abs() <= REFERENCE_MAX_M) {
-                return Err(named(format!("reference_m is {:?}, allowed is up to {REFERENCE_MAX_M} m", machine.reference_m)));
+            if !machine.reference_m.iter().all(|m| m.abs() <= POINT_MAX_M) {
+                return Err(named(format!("reference_m is {:?}, allowed is up to {POINT_MAX_M} m", machine.reference_m)));
             }
             if !machine.map.is_empty() {
                 check_name("map", &machine.map).map_err(|error| named(error.to_string()))?;

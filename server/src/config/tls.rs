@@ -43,7 +43,7 @@ impl TlsConfig {
             ("tls.fleet", given(&self.fleet), given(&self.client_ca), "tls.client_ca"),
         ];
         match needs.iter().find(|(_, this, other, _)| *this && !other) {
-            Some((key, .., other)) => Err(ServerError::Value { key, reason: format!("is given without `{other}`") }),
+            Some((key, .., other)) => Err(ServerError::value(key, format!("is given without `{other}`"))),
             None => Ok(()),
         }
     }

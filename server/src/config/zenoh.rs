@@ -83,18 +83,20 @@ impl ZenohConfig {
     pub(super) fn check(&self) -> Result<(), ServerError> {
         for (key, endpoints) in [("zenoh.listen", &self.listen), ("zenoh.connect", &self.connect)] {
             if let Some(endpoint) = endpoints.iter().find(|endpoint| !is_endpoint(endpoint)) {
-                let reason = format!("`{endpoint}` is no endpoint; expected for instance tcp/127.0.0.1:7447 or tls/router:7447");
-                return Err(ServerError::Value { key, reason });
+                return Err(ServerError::value(
+                    key,
+                    format!("`{endpoint}` is no endpoint; expected for instance tcp/127.0.0.1:7447 or tls/router:7447"),
+                ));
             }
         }
         if self.enabled && self.mode == ZenohMode::Client && self.connect.is_empty() {
-            let reason = "is empty, but with `zenoh.mode = \"client\"` it has to name a router, for instance tcp/router:7447".into();
-            return Err(ServerError::Value { key: "zenoh.connect", reason });
+            let reason = "is empty, but with `zenoh.mode = \"client\"` it has to name a router, for instance tcp/router:7447";
+            return Err(ServerError::value("zenoh.connect", reason));
         }
         let name = |key: &'static str, name: &str| {
             check_name(key, name).map_err(|error| match error {
-                EngineError::Invalid { reason, .. } => ServerError::Value { key, reason },
-                other => ServerError::Value { key, reason: other.to_string() },
+                EngineError::Invalid { reason, .. } => ServerError::value(key, reason),
+                other => ServerError::value(key, other.to_string()),
             })
         };
         if !self.name.is_empty() {

@@ -13,6 +13,7 @@ mod line;
 mod report;
 mod work;
 
+use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::time::Duration;
@@ -24,11 +25,14 @@ use tonic::{Code, Status};
 
 use crate::config::{Config, DiagnosisConfig};
 use crate::convert::{refused, to_status};
-use crate::recording::{Recorder, utc};
+use crate::recording::{Recorder, Recording, utc};
 use crate::web::Live;
 
 pub use report::knows_report;
 pub(crate) use work::Told;
+
+/// Runs before the present one in which a window is looked for.
+const RUNS_BEFORE: usize = 3;
 
 /// What a server needs to diagnose.
 #[derive(Debug)]
@@ -110,7 +114,7 @@ impl Diagnoses {
         if asked.from_stamp_ns.zip(asked.to_stamp_ns).is_some_and(|(from, to)| to < from) {
             return Err(refused(Code::InvalidArgument, "to_stamp_ns", "lies before from_stamp_ns"));
         }
-        let source = self.source(&asked.recording)?;
+        let source = self.source(&asked.recording, asked.from_stamp_ns)?;
         let most = self.config.at_once;
         let place = Arc::clone(&self.places).try_acquire_owned().map_err(|_| {
             let reason = format!("{most} may run at a time, as many as run now; wait for one to end, or raise `diagnosis.at_once`");
@@ -119,8 +123,19 @@ impl Diagnoses {
         Ok(Work { diagnoses: Arc::clone(self), asked, source, _place: place })
     }
 
-    /// The named recording; an empty name means the one that is being written.
-    fn source(&self, named: &str) -> Result<Source, Status> {
+    /// The parts of what this server recorded in its runs before, as far as it may still matter: an alarm lasts over a restart.
+    fn before(&self, run: &str) -> Vec<PathBuf> {
+        let entries = std::fs::read_dir(&self.recordings).into_iter().flatten().flatten().map(|entry| entry.path());
+        let runs: BTreeSet<String> =
+            entries.filter_map(|path| run_of(&path).map(String::from)).filter(|other| other.as_str() < run).collect();
+        let parts = runs.iter().rev().take(RUNS_BEFORE).map(|run| parts_of(&self.recordings, run));
+        // One that ended before it began, or that somebody has cleared in part, keeps nothing from being diagnosed.
+        parts.filter(|parts| Recording::open(parts).is_ok()).flatten().collect()
+    }
+
+    /// The named recording; an empty name means the one that is being written, and for a window that began at
+    /// some stamp those before, if there is not enough in it.
+    fn source(&self, named: &str, since: Option<i64>) -> Result<Source, Status> {
         let now = self.recorder.as_ref().map(|recorder| recorder.parts()).unwrap_or_default();
         let run = now.first().and_then(|part| run_of(part));
         if let Some(run) = run.filter(|run| named.is_empty() || named == *run) {
@@ -133,7 +148,9 @@ impl Diagnoses {
                 );
                 return Err(refused(Code::FailedPrecondition, "recording", reason));
             }
-            return Ok(Source { run: run.into(), files: now.clone(), live: ended.is_none() });
+            let mut files = if named.is_empty() && since.is_some() { self.before(run) } else { Vec::new() };
+            files.extend(now.clone());
+            return Ok(Source { run: run.into(), files, live: ended.is_none() });
         }
         if named.is_empty() {
             let reason =

@@ -20,7 +20,7 @@ const HALF_WIDTH: f64 = 1.96;
 ///
 /// # Errors
 /// What is wrong with the file.
-pub(super) fn read(folder: &Path, diagnosis_id: String, notes: Vec<String>) -> Result<(pb::DiagnosisReport, Value), String> {
+pub(super) fn read(folder: &Path, diagnosis_id: String, notes: Vec<String>) -> Result<pb::DiagnosisReport, String> {
     let file = folder.join(REPORT);
     let bytes = std::fs::metadata(&file).map_err(|error| format!("left no report: {error}"))?.len();
     if bytes > BYTES_MAX {
@@ -30,7 +30,7 @@ pub(super) fn read(folder: &Path, diagnosis_id: String, notes: Vec<String>) -> R
     let document: Value = serde_json::from_str(&json).map_err(|error| format!("left a report that is no JSON: {error}"))?;
     let verdict = verdict(&document).ok_or("left a report without a verdict")?;
     let bundle = document["bundle"].as_str().unwrap_or_default().to_string();
-    let report = pb::DiagnosisReport {
+    Ok(pb::DiagnosisReport {
         diagnosis_id,
         verdict: verdict.into(),
         reason: document["reason"].as_str().unwrap_or_default().into(),
@@ -40,8 +40,7 @@ pub(super) fn read(folder: &Path, diagnosis_id: String, notes: Vec<String>) -> R
         bundle_hash: bundle_hash(&bundle),
         bundle,
         notes,
-    };
-    Ok((report, document))
+    })
 }
 
 /// Whether a server takes what lies in the folder of a diagnosis as its report.
@@ -101,7 +100,7 @@ mod tests {
     fn read_document(document: &Value) -> Result<pb::DiagnosisReport, String> {
         let folder = tempfile::tempdir().unwrap();
         std::fs::write(folder.path().join(REPORT), document.to_string()).unwrap();
-        read(folder.path(), "d".into(), vec!["remark".into()]).map(|(report, _)| report)
+        read(folder.path(), "d".into(), vec!["remark".into()])
     }
 
     /// Goal: what the report claims is what a session takes. Method: a claim with an interval, a choice, one that the catalogue does not have.

@@ -77,12 +77,12 @@ impl Work {
             let (path, name) = (folder.path().to_path_buf(), folder.name());
             beside(move || report::read(&path, name, said.notes)).await?
         };
-        let (report, document) = read.map_err(|reason| Status::internal(format!("nesam diagnose {reason}")))?;
+        let report = read.map_err(|reason| Status::internal(format!("nesam diagnose {reason}")))?;
         let verdict = report.verdict().as_str_name();
         tracing::info!(session, diagnosis = folder.name(), verdict, effects = report.effects.len(), "diagnosis finished");
-        diagnoses.live.reports.add(document);
         let kept_max = diagnoses.config.kept_max;
         beside(move || folder.keep(kept_max)).await?;
+        diagnoses.live.reports.look_again();
         tell(told, Event::Report(report)).await;
         Ok(())
     }

@@ -3,7 +3,7 @@
 use std::collections::BTreeMap;
 use std::sync::Arc;
 
-use nesam_engine::{Command, Measurement, Reply};
+use nesam_engine::{AppliedEffect, Command, Measurement, Reply};
 use nesam_proto::v1 as pb;
 use nesam_terrain::WorldMap;
 use prost::Message as _;
@@ -12,12 +12,15 @@ use super::command::{HeldMaps, of_entries};
 use super::error::RecordingError;
 use super::reader::Recording;
 use super::topic::Topic;
+use crate::convert::applied_effects;
 
 /// The measurements of a session within a window of the vehicle's clock.
 #[derive(Clone, Debug)]
 pub struct RecordedWindow {
     /// The map that the session drove on; `None` without one.
     pub map: Option<Arc<WorldMap>>,
+    /// Effects that the session predicts with at the end of the recording, applied over those of its bundle: id, and parameters with their values.
+    pub applied: Vec<(String, Vec<(String, f64)>)>,
     /// Accepted measurements, in the order of the openings of the session and the starts and clocks of the vehicle, then by stamp.
     pub measurements: Vec<Measurement>,
 }
@@ -44,11 +47,16 @@ pub fn window(recording: &mut Recording, session: &str, from_ns: i64, to_ns: i64
     // Map of each session that was there.
     let mut map_of: BTreeMap<String, Option<String>> = BTreeMap::new();
     let mut lines: Vec<Line> = Vec::new();
+    let mut applied = Vec::new();
     while let Some(recorded) = recording.next_command()? {
         let unreadable =
             |reason: String| RecordingError::unusable(run.as_ref(), format!("command {} cannot be read: {reason}", recorded.index));
         let command = of_entries(&recorded.asked, &limits, &maps).map_err(unreadable)?;
         let (topic, answer) = &recorded.answer;
+        let told = (*topic == Topic::Session).then(|| pb::Session::decode(&answer[..]).ok()).flatten();
+        if let Some(told) = told.filter(|told| told.session_id == session) {
+            applied = applied_effects("", &told.effects).effects;
+        }
         // Name, map and first measurement of a session that begins.
         let begun = match &command {
             Command::PutMap { .. } | Command::DeleteMap { .. } if *topic != Topic::Refused => {
@@ -97,7 +105,9 @@ pub fn window(recording: &mut Recording, session: &str, from_ns: i64, to_ns: i64
         line.measurements.sort_by_key(|m| m.stamp_ns);
     }
     let map = map_id.and_then(|id| maps.get(&id));
-    Ok(RecordedWindow { map, measurements: lines.into_iter().flat_map(|line| line.measurements).collect() })
+    let parameters = |effect: AppliedEffect| (effect.id, effect.parameters.into_iter().map(|p| (p.name, p.value)).collect());
+    let applied = applied.into_iter().map(parameters).collect();
+    Ok(RecordedWindow { map, applied, measurements: lines.into_iter().flat_map(|line| line.measurements).collect() })
 }
 
 /// Of the answer to an accepted measurement: whether another clock begins with it.

@@ -7,14 +7,15 @@ use tokio::sync::watch;
 
 use super::Keeper;
 use crate::grpc::stopped;
+use crate::web::{Feed, Raised};
 
 /// Time between two looks.
 const LOOK_EVERY: Duration = Duration::from_secs(1);
 /// Time beyond `store.interval_s` after which a store hangs (chosen: a commit takes milliseconds, on a slow disk a second).
 const LATE: Duration = Duration::from_secs(5);
 
-/// Tells the log when the store hangs, once, and when it goes on, until the server stops.
-pub(crate) async fn tell_stalls(keeper: Arc<Keeper>, interval: Duration, stopping: watch::Receiver<bool>) {
+/// Tells the log and the live page when the store hangs, once, and when it goes on, until the server stops.
+pub(crate) async fn tell_stalls(keeper: Arc<Keeper>, interval: Duration, page: Feed, stopping: watch::Receiver<bool>) {
     let stop = stopped(stopping);
     tokio::pin!(stop);
     let mut stall = Stall { after: interval.saturating_add(LATE), said: false };
@@ -27,8 +28,12 @@ pub(crate) async fn tell_stalls(keeper: Arc<Keeper>, interval: Duration, stoppin
             Some(Told::Hangs(oldest)) => {
                 let (oldest_s, waiting) = (oldest.as_secs_f64(), keeper.counts().waiting);
                 tracing::error!(oldest_s, waiting, "the store hangs: what has changed since is received and not durable");
+                page.alarm(Raised::by_store(Some(oldest_s)));
             }
-            Some(Told::GoesOn) => tracing::info!("the store goes on"),
+            Some(Told::GoesOn) => {
+                tracing::info!("the store goes on");
+                page.alarm(Raised::by_store(None));
+            }
             None => {}
         }
     }

@@ -2,7 +2,7 @@
 
 use std::borrow::Cow;
 
-use nesam_engine::{EngineError, SOIL_NOT_LEARNED};
+use nesam_engine::{AppliedEffect, EngineError, SOIL_NOT_LEARNED};
 use nesam_model::flag;
 use serde_json::{Value, json};
 
@@ -46,6 +46,13 @@ pub(crate) struct Raised {
 }
 
 impl Raised {
+    /// Whether the store hangs, and for how long by now.
+    pub fn by_store(hangs_s: Option<f64>) -> Self {
+        let what = format!("the store has taken nothing for {:.0} s: what vehicles report is not durable", hangs_s.unwrap_or(0.0));
+        let advice = "make room on its disk, or see whether the disk, or etcd, answers".into();
+        Self { session: None, id: "store".into(), what, advice, active: hangs_s.is_some() }
+    }
+
     /// What the watch of a session says.
     pub fn by_watch(session: &str, alarm: &nesam_engine::Alarm) -> Self {
         let advice = format!("diagnose what was recorded: {}", alarm.diagnose(session));
@@ -100,7 +107,8 @@ pub(crate) fn alarms(notes: &Notes, facts: ServiceFacts, now_s: f64) -> Vec<Alar
         advice: raised.advice.clone().into(),
     }));
     for (name, session) in &notes.sessions {
-        let of_session = [link(session, now_s), measurements(session, now_s), soil(session), candidates(session, now_s)].concat();
+        let of_session =
+            [link(session, now_s), measurements(session, now_s), soil(session), effects(session), candidates(session, now_s)].concat();
         found.extend(of_session.into_iter().map(|alarm| Alarm { session: Some(name.clone()), ..alarm }));
     }
     found.sort_by_key(|alarm| alarm.level);
@@ -173,6 +181,21 @@ fn soil(session: &SessionNotes) -> Vec<Alarm> {
         return vec![alarm(Level::Alarm, "gated", what, advice)];
     }
     Vec::new()
+}
+
+/// What was applied to a session changes every prediction of its vehicle.
+fn effects(session: &SessionNotes) -> Vec<Alarm> {
+    let one = |effect: &AppliedEffect| {
+        let values: Vec<String> = effect.parameters.iter().map(|p| format!("{} {}", p.name, p.value)).collect();
+        format!("{} ({})", effect.id, values.join(", "))
+    };
+    let applied: Vec<String> = session.effects.effects.iter().map(one).collect();
+    if applied.is_empty() {
+        return Vec::new();
+    }
+    let from = if session.effects.source.is_empty() { String::new() } else { format!(", from {}", session.effects.source) };
+    let what = format!("predicts with {}{from}", applied.join(", "));
+    vec![alarm(Level::Notice, "effects", what, "`nesam effects revert` takes them away, once the vehicle is as it was")]
 }
 
 fn candidates(session: &SessionNotes, now_s: f64) -> Vec<Alarm> {

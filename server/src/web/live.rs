@@ -4,6 +4,7 @@
 //! closed.
 
 use std::convert::Infallible;
+use std::path::Path;
 use std::sync::Arc;
 use std::time::Duration;
 
@@ -21,7 +22,7 @@ use super::painter::{Desk, Painter, Update};
 use super::reports::Reports;
 use super::terrain::Pictures;
 use crate::clock::MonotonicClock;
-use crate::config::HttpConfig;
+use crate::config::Config;
 use crate::grpc::{Edge, stopped};
 use crate::http::HttpState;
 use crate::recording::Recorder;
@@ -53,10 +54,11 @@ impl Drop for Place {
 
 impl Live {
     /// A page that nobody watches yet, and what passes by for its painter.
-    pub fn new(config: &HttpConfig) -> (Self, mpsc::Receiver<Note>) {
+    pub fn new(config: &Config) -> (Self, mpsc::Receiver<Note>) {
         let (feed, passed) = Feed::new();
-        let reports = Reports::new(&config.reports);
-        (Self { feed, reports, pictures: Pictures::default(), desk: Arc::new(Desk::new()), watchers_max: config.watchers_max }, passed)
+        let made_here = if config.recording.enabled { config.diagnosis.directory.as_path() } else { Path::new("") };
+        let reports = Reports::new(&[&config.http.reports, made_here]);
+        (Self { feed, reports, pictures: Pictures::default(), desk: Arc::new(Desk::new()), watchers_max: config.http.watchers_max }, passed)
     }
 
     /// Starts the thread that makes the updates. Where the system refuses one, the page stays without them.

@@ -3,7 +3,9 @@
 use std::collections::{BTreeMap, VecDeque};
 use std::sync::Arc;
 
-use nesam_engine::{BufferTest, EngineError, MeasureAnswer, Measurement, Prediction, SessionView, SoilEstimate, WheelMeasurement};
+use nesam_engine::{
+    AppliedEffects, BufferTest, EngineError, MeasureAnswer, Measurement, Prediction, SessionView, SoilEstimate, WheelMeasurement,
+};
 
 use super::alarms::Raised;
 use super::feed::Note;
@@ -100,6 +102,8 @@ pub(crate) struct SessionNotes {
     pub newest: Option<(Measurement, f64)>,
     /// Driven path: stamp in s, x, y, speed over ground.
     pub trail: Ring<[f64; 4]>,
+    /// Effects that were applied, over those of the bundle.
+    pub effects: AppliedEffects,
     /// Steps in the history.
     pub history_steps: usize,
     /// Measurements by what became of them.
@@ -183,6 +187,7 @@ impl Notes {
         let Some(session) = self.session(view.session.clone()) else { return };
         session.vehicle.clone_from(&view.vehicle);
         session.map.clone_from(&view.provenance.map);
+        session.effects.clone_from(&view.effects);
         session.history_steps = view.history_steps;
         session.soil = Some(view.soil);
         if let (None, Some(step)) = (&session.newest, &view.newest) {

@@ -18,7 +18,7 @@ const LOOK_EVERY_S: f64 = 5.0;
 /// The reports. Clones share them.
 #[derive(Clone, Debug, Default)]
 pub(crate) struct Reports {
-    folder: Option<PathBuf>,
+    folders: Vec<PathBuf>,
     added: Arc<Mutex<Added>>,
     looked: Arc<Mutex<Option<(Instant, u64)>>>,
 }
@@ -33,9 +33,19 @@ struct Added {
 }
 
 impl Reports {
-    /// Reports of a folder and one level of folders in it; an empty path = only those that are added.
-    pub fn new(folder: &Path) -> Self {
-        Self { folder: (!folder.as_os_str().is_empty()).then(|| folder.into()), ..Self::default() }
+    /// Reports of folders and one level of folders in each, beside those that are added; an empty path is none.
+    pub fn new(folders: &[&Path]) -> Self {
+        let mut named: Vec<PathBuf> = folders.iter().filter(|folder| !folder.as_os_str().is_empty()).map(|folder| place(folder)).collect();
+        named.sort();
+        named.dedup();
+        Self { folders: named, ..Self::default() }
+    }
+
+    /// Looks into the folders at the next time it is asked, not only after a while.
+    pub fn look_again(&self) {
+        if let Ok(mut looked) = self.looked.lock() {
+            *looked = None;
+        }
     }
 
     /// Adds one. What is not a report of a diagnosis is left out.
@@ -57,7 +67,7 @@ impl Reports {
                 let newest = |files: &[(SystemTime, PathBuf)]| {
                     files.first().and_then(|(at, _)| at.duration_since(SystemTime::UNIX_EPOCH).ok()).map_or(0, |d| d.as_millis() as u64)
                 };
-                let files = self.folder.as_deref().map(files).unwrap_or_default();
+                let files = files(&self.folders);
                 let seen = newest(&files).wrapping_mul(31).wrapping_add(files.len() as u64);
                 *looked = Some((Instant::now(), seen));
                 seen
@@ -69,7 +79,7 @@ impl Reports {
     /// What the page shows of each report, the newest first.
     pub fn read(&self) -> Value {
         let mut shown = self.added.lock().map(|added| added.newest.clone()).unwrap_or_default();
-        for (_, file) in self.folder.as_deref().map(files).unwrap_or_default() {
+        for (_, file) in files(&self.folders) {
             if shown.len() >= SHOWN_MAX {
                 break;
             }
@@ -84,13 +94,21 @@ impl Reports {
 /// How many reports of a folder the live page shows.
 #[must_use]
 pub fn shown_reports(folder: &Path) -> usize {
-    Reports::new(folder).read().as_array().map_or(0, Vec::len)
+    Reports::new(&[folder]).read().as_array().map_or(0, Vec::len)
 }
 
-/// JSON files of a folder and of the folders in it, the newest first.
-fn files(folder: &Path) -> Vec<(SystemTime, PathBuf)> {
+/// A folder by a name that is the same however it was given.
+fn place(folder: &Path) -> PathBuf {
+    folder.canonicalize().or_else(|_| std::path::absolute(folder)).unwrap_or_else(|_| folder.into())
+}
+
+/// JSON files of folders and of the folders in them, the newest first.
+fn files(folders: &[PathBuf]) -> Vec<(SystemTime, PathBuf)> {
     let entries = |folder: &Path| std::fs::read_dir(folder).into_iter().flatten().flatten().map(|entry| entry.path());
-    let all = entries(folder).flat_map(|path| if path.is_dir() { entries(&path).collect() } else { vec![path] });
+    let all = folders
+        .iter()
+        .flat_map(|folder| entries(folder))
+        .flat_map(|path| if path.is_dir() { entries(&path).collect() } else { vec![path] });
     let json = all.take(ENTRIES_MAX).filter(|path| path.extension().is_some_and(|e| e == "json"));
     let dated = json.filter_map(|path| {
         let about = std::fs::metadata(&path).ok().filter(|about| about.is_file() && about.len() <= BYTES_MAX)?;
@@ -140,7 +158,7 @@ mod tests {
         write("other.json", r#"{"schema":"nesam.bench/1"}"#);
         write("torn.json", r#"{"schema":"nesam.diag"#);
         write("run/report.json", r#"{"schema":"nesam.diagnose/1","set":"s","verdict":"none","effects":[]}"#);
-        let reports = Reports::new(folder.path());
+        let reports = Reports::new(&[folder.path()]);
         let shown = reports.read();
         assert_eq!(shown.as_array().map(Vec::len), Some(1), "{shown}");
         assert_eq!(shown[0]["set"], "s");

@@ -84,7 +84,12 @@ pub fn access_control(members: &FleetFile, fleet: &str, ros2: &Ros2Config) -> Va
                 }
             }
             Identity::Planner(name) => planner(&mut member, fleet, &members.vehicles_of_planner(name).collect::<Vec<_>>()),
-            Identity::Operator(_) => operator(&mut member, fleet),
+            Identity::Operator(_) => {
+                operator(&mut member, fleet);
+                if ros2.enabled {
+                    watches_ros2(&mut member, ros2);
+                }
+            }
             Identity::Server(name) => {
                 server(&mut member, fleet, name);
                 if ros2.enabled {
@@ -161,25 +166,37 @@ fn said_by(ros2: &Ros2Config, machine: &Ros2Vehicle) -> Vec<String> {
     [domain.key_of_any_version(&machine.odometry_topic(), ODOMETRY)].into_iter().chain(command).collect()
 }
 
-/// Keys of what such a machine is told.
-fn told_to(ros2: &Ros2Config, machine: &Ros2Vehicle) -> Vec<String> {
-    vec![ros2.domain().key(&machine.soil_topic(), FLOAT64_MULTI_ARRAY), ros2.domain().key(DIAGNOSTICS, DIAGNOSTIC_ARRAY)]
+/// Key of what such a machine is told.
+fn told_to(ros2: &Ros2Config, machine: &Ros2Vehicle) -> String {
+    ros2.domain().key(&machine.soil_topic(), FLOAT64_MULTI_ARRAY)
+}
+
+/// Keys of what is told of machines: the soil of each, and the diagnostics of all together.
+fn told_of_all(ros2: &Ros2Config) -> Vec<String> {
+    let soils = ros2.vehicles.iter().map(|machine| told_to(ros2, machine));
+    soils.chain([ros2.domain().key(DIAGNOSTICS, DIAGNOSTIC_ARRAY)]).collect()
 }
 
 /// A vehicle that speaks ROS 2: its own topics. The graph of its domain is open to it, as tokens do not tell whose they are.
 fn machine_of_ros2(member: &mut Member<'_>, ros2: &Ros2Config, machine: &Ros2Vehicle) {
     member.allow(&["ingress"], &["put"], said_by(ros2, machine));
     member.allow(&["egress"], &["declare_subscriber"], said_by(ros2, machine));
-    member.hears(told_to(ros2, machine));
+    member.hears(vec![told_to(ros2, machine)]);
     sees_the_graph(member, ros2);
 }
 
 /// A server in the graph of ROS 2: the topics of all machines.
 fn node_of_ros2(member: &mut Member<'_>, ros2: &Ros2Config) {
     member.hears(ros2.vehicles.iter().flat_map(|machine| said_by(ros2, machine)).collect());
-    let told: Vec<String> = ros2.vehicles.iter().flat_map(|machine| told_to(ros2, machine)).collect();
+    let told = told_of_all(ros2);
     member.allow(&["ingress"], &["put"], told.clone());
     member.allow(&["egress"], &["declare_subscriber"], told);
+    sees_the_graph(member, ros2);
+}
+
+/// Somebody who watches all machines of ROS 2.
+fn watches_ros2(member: &mut Member<'_>, ros2: &Ros2Config) {
+    member.hears(told_of_all(ros2));
     sees_the_graph(member, ros2);
 }
 
@@ -232,6 +249,8 @@ pub fn router_config(members: &FleetFile, fleet: &str, servers: &Config, listen:
 
 #[cfg(test)]
 mod tests {
+    use std::collections::BTreeSet;
+
     use super::*;
 
     /// Keys outside of `a/` that vehicle `a` and the planner of `a` may use: they tell of no vehicle.
@@ -266,11 +285,11 @@ mod tests {
 
     #[test]
     fn property_a_machine_of_ros2_says_nothing_on_topics_of_another() {
-        let members = FleetFile::parse("servers = [\"s\"]\n[vehicles.a]\n[vehicles.b]\n[vehicles.c]").unwrap();
+        let members = FleetFile::parse("operators = [\"o\"]\nservers = [\"s\"]\n[vehicles.a]\n[vehicles.b]\n[vehicles.c]").unwrap();
         let machine = |vehicle: &str| Ros2Vehicle { vehicle: vehicle.into(), ..Ros2Vehicle::default() };
         let mut ros2 = Ros2Config { enabled: true, vehicles: vec![machine("a"), machine("b")], ..Ros2Config::default() };
         let rules = access_control(&members, "f", &ros2);
-        let mut said = [0, 0, 0];
+        let (mut said, mut hear_all) = ([0, 0, 0], BTreeSet::new());
         for rule in rules["rules"].as_array().unwrap() {
             let who = rule["id"].as_str().unwrap();
             let has = |list: &str, value: &str| rule[list].as_array().unwrap().iter().any(|held| held == value);
@@ -278,8 +297,11 @@ mod tests {
                 if key.starts_with("nesam/") {
                     continue;
                 }
+                if key.starts_with("0/diagnostics/") && has("flows", "egress") && has("messages", "put") {
+                    hear_all.insert(who.split(':').nth(1).unwrap());
+                }
                 for (i, name) in ["a", "b", "c"].into_iter().enumerate().filter(|(_, name)| who.contains(&format!("vehicle:{name} "))) {
-                    let own = key.starts_with(&format!("0/{name}/")) || key.starts_with("@ros2_lv/0/") || key.starts_with("0/diagnostics/");
+                    let own = key.starts_with(&format!("0/{name}/")) || key.starts_with("@ros2_lv/0/");
                     assert!(own && name != "c", "{who}: {key}");
                     let speaks = has("flows", "ingress") && has("messages", "put");
                     said[i] += usize::from(speaks);
@@ -288,6 +310,8 @@ mod tests {
             }
         }
         assert_eq!(said, [2, 2, 0]);
+        // Of all machines together operators alone hear.
+        assert_eq!(hear_all, BTreeSet::from(["operator"]));
         ros2.enabled = false;
         assert_eq!(access_control(&members, "f", &ros2), access_control(&members, "f", &Ros2Config::default()));
     }

@@ -46,8 +46,10 @@ async fn service_a_machine_of_ros2_is_heard_on_its_own_topics_alone() {
         zenoh::open(zenoh::Config::from_json5(&joining(&endpoint, &certificate, &key, &ca)).unwrap()).await.unwrap()
     };
     let (truck, other) = (joined("nesam:vehicle:truck").await, joined("nesam:vehicle:other").await);
-    // As rmw_zenoh subscribes: to the whole key.
-    let heard = truck.declare_subscriber(format!("0/diagnostics/{DIAGNOSTICS}")).await.unwrap();
+    let control = joined("nesam:operator:control").await;
+    // As rmw_zenoh subscribes: to the whole key. Diagnostics tell of all machines: of alarms, effects and soils of others.
+    let [heard, of_all] = [&control, &truck].map(|session| session.declare_subscriber(format!("0/diagnostics/{DIAGNOSTICS}")));
+    let (heard, of_all) = (heard.await.unwrap(), of_all.await.unwrap());
     let of_other = truck.declare_subscriber(format!("0/other/odom/{ODOMETRY}")).await.unwrap();
     // Each on its own topic until it is heard: whoever joins has to be let through first.
     for (machine, name) in [(&truck, "truck"), (&other, "other")] {
@@ -63,7 +65,7 @@ async fn service_a_machine_of_ros2_is_heard_on_its_own_topics_alone() {
         publishing.await.unwrap();
     }
     assert!(of_other.try_recv().unwrap().is_none(), "what a machine says is for servers");
-    eventually(PATIENCE, "a machine hears diagnostics", async || heard.try_recv().unwrap().is_some()).await;
+    eventually(PATIENCE, "an operator hears diagnostics", async || heard.try_recv().unwrap().is_some()).await;
     let before = (accepted("truck").await, accepted("other").await);
     let late = &messages["/truck/odom"][100];
     let mut later = late.clone();
@@ -74,6 +76,7 @@ async fn service_a_machine_of_ros2_is_heard_on_its_own_topics_alone() {
     assert_eq!((accepted("truck").await, accepted("other").await), before, "a machine is heard in another one's name");
     other.put(format!("0/other/odom/{ODOMETRY}"), later).await.unwrap();
     eventually(PATIENCE, "the same message from the machine itself", async || accepted("other").await == before.1 + 1).await;
+    assert!(of_all.try_recv().unwrap().is_none(), "a machine hears what is told of others");
     stage.server.shutdown().await;
     router.close().await.unwrap();
 }

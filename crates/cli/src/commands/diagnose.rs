@@ -3,19 +3,19 @@
 mod fitted;
 mod hypotheses;
 mod recording;
+mod summary;
 
 use std::path::PathBuf;
 use std::sync::{Arc, Mutex};
 
 use clap::Args;
-use nesam_discovery::observe::channels::{self, CHANNELS};
-use nesam_discovery::report::{Report, describe};
+use nesam_discovery::observe::channels::CHANNELS;
+use nesam_discovery::report::Report;
 use nesam_discovery::{
-    Against, Bench, DRIVES_MIN, Diagnosis, Judge, Options, Reference, ReferenceDrives, SEGMENT_STEPS, Scoring, Segmented, catalogue,
-    diagnose, observe_all,
+    Against, Bench, DRIVES_MIN, Judge, Options, Reference, ReferenceDrives, SEGMENT_STEPS, Scoring, Segmented, catalogue, diagnose,
+    observe_all,
 };
-use nesam_evaluation::report::Short;
-use nesam_evaluation::{DEFAULT_RESAMPLES, POSE_DIM, Provenance as ReportProvenance};
+use nesam_evaluation::{DEFAULT_RESAMPLES, Provenance as ReportProvenance};
 use nesam_import::doubts;
 use nesam_model::{ModelBundle, Predictor};
 use nesam_physics::Vehicle;
@@ -24,6 +24,7 @@ use nesam_terrain::WorldMap;
 use nesam_trajectories::{Split, Trajectory};
 
 use self::recording::RecordingArgs;
+use self::summary::{bundles, summary};
 use crate::args::{BundleArgs, CommandsArgs, DataArgs, WindowArgs};
 use crate::bundle_path::bundle_dir;
 use crate::bundle_version::{save_with_effects, set_aside};
@@ -32,11 +33,6 @@ use crate::output::say;
 use crate::progress::Progress;
 use crate::sources::{check_own_vehicle, load_bundle, load_bundle_for, predictor_for, read_drives, validation_drives};
 use crate::{interrupt, output};
-
-/// Hypotheses in the printed table.
-const SHOWN: usize = 12;
-/// Channels whose levels stand out that are printed, loudest first.
-const SHOWN_LEVELS: usize = 3;
 
 /// Options of `nesam diagnose`.
 #[derive(Args, Debug)]
@@ -117,6 +113,8 @@ struct Input {
     provenance: ReportProvenance,
     /// Drives of the set that are too short to be judged beside the others, with their samples.
     short: Vec<(String, usize)>,
+    /// What else to know of them.
+    notes: Vec<String>,
 }
 
 /// The drives of a set in a data root.
@@ -142,7 +140,7 @@ fn of_set(args: &DiagnoseArgs) -> Result<Input, Failure> {
     let predictor = predictor_for(load_bundle_for(args.bundle.bundle.as_deref(), &drives.root)?, &drives.root, args.data.dt)?;
     let provenance = output::provenance(Some(predictor.bundle()), &drives);
     let data_hash = drives.root.hash();
-    Ok(Input { set: drives.set, drives: drives.drives, maps: drives.maps, data_hash, predictor, provenance, short })
+    Ok(Input { set: drives.set, drives: drives.drives, maps: drives.maps, data_hash, predictor, provenance, short, notes: Vec::new() })
 }
 
 /// Runs the command.
@@ -324,6 +322,7 @@ fn diagnose_set(args: &DiagnoseArgs) -> Result<(), Failure> {
         dt_s: predictor.bundle().normalization.dt_s,
         against: reference.into(),
         doubts: &doubts,
+        notes: &drives.notes,
     };
     summary(&report, &found);
     bundles(&report);
@@ -331,114 +330,6 @@ fn diagnose_set(args: &DiagnoseArgs) -> Result<(), Failure> {
     output::write_file(&html, report.to_html().as_bytes())?;
     say!("\nwrote {} and {}", json.display(), html.display());
     Ok(())
-}
-
-/// Where the bundles are that have what was found.
-fn bundles(report: &Report<'_>) {
-    let told = [(report.bundle, "what is claimed"), (report.free_form_bundle, "what is claimed and the free form of what is left")];
-    for (bundle, what) in told.into_iter().filter_map(|(bundle, what)| Some((bundle?, what))) {
-        say!("bundle with {what}: {bundle}");
-    }
-    let another_ground = report.diagnosis.soils.is_some_and(|soils| soils.alone != soils.assumed);
-    if report.bundle.is_none() && another_ground && matches!(report.against, Against::Physics) {
-        say!(
-            "what to do: `nesam calibrate` with --bundle fits the card on the ground that the drives tell of; then diagnose with the bundle that it writes"
-        );
-    }
-}
-
-fn summary(report: &Report<'_>, found: &Diagnosis) {
-    say!("{}: {} - {}", report.set, found.verdict.as_str().to_uppercase(), found.reason);
-    report.left_out().iter().for_each(|left_out| say!("{left_out}"));
-    report.doubts.iter().for_each(|doubt| say!("doubt: {doubt} (`nesam check` tells more; a claim may be wrong by it)"));
-    let s = &found.selection;
-    let p = s.probability.map_or(String::new(), |[p, least]| format!("; family-wise p = {p:.4} (smallest that can be shown {least:.4})"));
-    say!(
-        "\nevidence against {} (threshold z = {:.2}{p})",
-        match report.against {
-            Against::Bundle => "drives without an effect",
-            Against::Physics => "random signs of the drives",
-        },
-        s.threshold
-    );
-    let mut order: Vec<usize> = (0..found.catalogue.len()).filter(|e| s.z[*e].is_some()).collect();
-    order.sort_by(|a, b| s.z[*b].unwrap_or(0.0).total_cmp(&s.z[*a].unwrap_or(0.0)));
-    for e in order.into_iter().take(SHOWN) {
-        say!("  {:<24} z {:7.1}", found.catalogue[e].label(), s.z[e].unwrap_or(0.0));
-    }
-    let levels = found.levels_seen().into_iter().map(|(z, channel)| (z, channels::level_name(channel)));
-    let bends = found.bends_seen().into_iter().map(|(z, bend)| (z, bend.name()));
-    for mut evidence in [levels.collect::<Vec<_>>(), bends.collect()] {
-        evidence.sort_by(|a, b| b.0.total_cmp(&a.0));
-        for (z, what) in evidence.into_iter().take_while(|(z, _)| *z >= s.threshold).take(SHOWN_LEVELS) {
-            say!("  {what:<24} z {z:7.1}");
-        }
-    }
-    for f in &found.findings {
-        let rivals: Vec<String> = f.rivals.iter().map(|r| format!("{} ({:.2})", r.candidate.label(), r.weight)).collect();
-        let rivals = if rivals.is_empty() { String::new() } else { format!("; rivals {}", rivals.join(", ")) };
-        let refused = f.refused.as_ref().map_or(String::new(), |why| format!("; refused: {why}"));
-        say!(
-            "{}: z {:.1} after the others, criterion {:+.1}, stability {:.2}; {}{rivals}{refused}",
-            f.candidate.label(),
-            f.alone,
-            f.delta_bic,
-            f.stability,
-            describe(f)
-        );
-        for e in &f.estimates {
-            let interval = e.ci95.map_or(String::new(), |[low, high]| format!("[{}, {}] ", Short(low), Short(high)));
-            say!("  {} = {} {interval}{}", e.name, Short(e.value), e.unit);
-        }
-    }
-    let (z, what) = &s.remaining;
-    let place = if what.is_empty() { String::new() } else { format!(" in {what}") };
-    say!("{}: z = {z:.1}{place}", if s.chosen.is_empty() { "the most that stands out" } else { "left after that" });
-    let stages = report.stages();
-    if stages.is_empty() {
-        return;
-    }
-    say!(
-        "\n{:<28}{:>9}{:>9}{:>9}{:>9}{:>9}{:>9}{:>9}{:>9}",
-        "drives not fitted",
-        "x m",
-        "y m",
-        "z m",
-        "roll °",
-        "pitch °",
-        "yaw °",
-        "pos. m",
-        "final m"
-    );
-    let stages = stages.into_iter().map(|(name, tree)| (name.to_string(), tree));
-    for (name, tree) in stages.chain(report.control_errors()) {
-        let numbers: [Option<f64>; POSE_DIM] = tree.mae_mean.to_array();
-        let cells: String = numbers
-            .iter()
-            .chain([&tree.position_m.mean, &tree.position_m.final_])
-            .map(|v| v.map_or("        –".into(), |v| format!("{v:9.3}")))
-            .collect();
-        say!("{name:<28}{cells}");
-    }
-    if let Some(n) = &found.null_drives {
-        let helped = n.null.iter().filter(|g| **g > 0.0).count();
-        say!("the same effects on {} drives without one: they would help {helped}", n.null.len());
-    }
-    if found.claimed.is_empty() {
-        return;
-    }
-    for (name, gain, interval) in report.gains() {
-        let numbers = gain.mae_mean.to_array().into_iter().chain([gain.position_m.mean, gain.position_m.final_]);
-        let ends = interval.mae_mean.to_array().into_iter().chain([interval.position_m.mean, interval.position_m.final_]);
-        let cells: Vec<String> = numbers
-            .zip(ends)
-            .map(|(g, i)| match (g, i) {
-                (Some(g), Some([low, high])) => format!("{g:+.3} [{low:+.3}, {high:+.3}]"),
-                _ => "–".into(),
-            })
-            .collect();
-        say!("{name:<22}{}", cells.join("  "));
-    }
 }
 
 /// One progress bar after the other.

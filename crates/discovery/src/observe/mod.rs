@@ -16,7 +16,7 @@ use std::sync::Arc;
 use nesam_evaluation::{DriveMaps, history_steps};
 use nesam_model::{GroundSource, ModelBundle, Predictor, Transition};
 use nesam_physics::driveline::{DrivelineState, command_wheels, rim_twist};
-use nesam_physics::effects::{MapTerms, Phases, ScheduledEffect};
+use nesam_physics::effects::{Effect, MapTerms, Phases, ScheduledEffect};
 use nesam_physics::step::{StepInput, StepModel, StepOutput};
 use nesam_physics::{Ride, SOIL_DIM, STATE_DIM, SecondCommand, Soil, SoilCorrection, UsualRide, Vehicle, VehicleState, WHEELS, wrap_angle};
 use nesam_terrain::WorldMap;
@@ -71,8 +71,10 @@ impl Stepping {
 /// The reference that drives are compared with, and what may explain the difference.
 #[derive(Clone, Copy, Debug)]
 pub struct Bench<'a> {
-    /// Vehicle of the reference.
+    /// Vehicle of the reference, all of its effects begun.
     pub vehicle: &'a Vehicle,
+    /// Effects of the reference, each from its onset on.
+    pub effects: &'a [ScheduledEffect],
     /// Physics.
     pub stepping: Stepping,
     /// All hypotheses.
@@ -84,14 +86,26 @@ pub struct Bench<'a> {
 impl<'a> Bench<'a> {
     /// With all of these hypotheses, on the ground as it is assumed.
     pub fn new(bundle: &'a ModelBundle, catalogue: &'a [Candidate]) -> Self {
-        Self { vehicle: &bundle.vehicle, stepping: Stepping::of(bundle), catalogue, ground: SoilCorrection::NONE }
+        let ModelBundle { vehicle, effects, .. } = bundle;
+        Self { vehicle, effects, stepping: Stepping::of(bundle), catalogue, ground: SoilCorrection::NONE }
     }
 }
 
 impl Bench<'_> {
-    /// Physics of the vehicle in each phase of a drive in which effects begin.
+    /// Physics of the vehicle in each phase of a drive in which effects begin, beside those of the reference that always act.
     fn phases(&self, effects: &[ScheduledEffect]) -> Phases<StepModel> {
-        Phases::of(effects, |begun| self.stepping.model(&self.vehicle.with_effects(begun)))
+        let of = |vehicle: &Vehicle| Phases::of(effects, |begun| self.stepping.model(&vehicle.with_effects(begun)));
+        if self.late().next().is_none() {
+            return of(self.vehicle);
+        }
+        let always: Vec<Effect> = self.effects.iter().filter(|e| e.onset_s <= 0.0).map(|e| e.effect).collect();
+        let bare = Vehicle { effects: Default::default(), ..self.vehicle.clone() };
+        of(&bare.with_effects(&always))
+    }
+
+    /// Effects of the reference that begin within a log.
+    fn late(&self) -> impl Iterator<Item = ScheduledEffect> {
+        self.effects.iter().filter(|e| e.onset_s > 0.0).copied()
     }
 }
 
@@ -290,6 +304,7 @@ fn traction_slopes(model: &StepModel, transition: &Transition) -> [f64; WHEELS] 
 impl ObservedDrive {
     /// Measured minus predicted for every segment, with effects (each from its onset on) and a soil correction. One row per segment.
     pub fn deviations(&self, bench: &Bench<'_>, effects: &[ScheduledEffect], soil: &SoilCorrection) -> Vec<Row> {
+        let effects: Vec<ScheduledEffect> = bench.late().chain(effects.iter().copied()).collect();
         let acting = |start: usize| -> u32 {
             let time_s = start as f64 * bench.stepping.dt_s;
             effects.iter().enumerate().map(|(i, e)| u32::from(e.onset_s <= time_s) << i).sum()
@@ -388,8 +403,9 @@ impl ObservedDrive {
     /// physics says of them.
     pub fn driven_again(&self, bench: &Bench<'_>, effects: &[ScheduledEffect], drive: &mut Trajectory) {
         let dt_s = bench.stepping.dt_s;
-        let plain = self.reading(bench, &[]);
-        let phases = bench.phases(effects);
+        let known: Vec<ScheduledEffect> = bench.late().collect();
+        let plain = self.reading(bench, &known);
+        let phases = bench.phases(&[&known, effects].concat());
         let mut actuators = plain.actuators[0][0];
         let mut state = self.states[0];
         for (k, transition) in self.transitions.iter().enumerate() {

@@ -4,7 +4,7 @@ use std::collections::BTreeMap;
 use std::sync::{Arc, Mutex, MutexGuard};
 use std::time::{Duration, Instant};
 
-use nesam_engine::{Command, EngineError, MeasureAnswer, Measurement, OpenSession, WheelMeasurement};
+use nesam_engine::{Command, EngineError, MeasureAnswer, Measurement, OpenSession, Outcome, WheelMeasurement};
 use nesam_physics::{Control, VehicleState};
 use nesam_ros2::messages::{CommandType, Level, Odometry};
 
@@ -37,8 +37,14 @@ pub struct Heard {
     moved: Option<Instant>,
     /// Whether the last measurement came with a command that held.
     commanded: bool,
-    /// Why the last measurement or command was refused; `None` where it was not.
+    /// Why the session cannot be opened; `None` where it is open, or nobody has tried.
+    unopened: Option<String>,
+    /// Why the last measurement was refused; `None` where it was not.
     refused: Option<String>,
+    /// Why the last command was refused; `None` where it was not.
+    command_refused: Option<String>,
+    /// Time that was missing before the last measurement, s; `None` where it continued the history.
+    gap_s: Option<f64>,
     /// Messages by what became of them.
     counts: BTreeMap<&'static str, u64>,
 }
@@ -50,14 +56,22 @@ impl Heard {
 
     /// How well the machine is heard, in one sentence.
     pub fn level(&self) -> (Level, String) {
-        match (self.moved, &self.refused) {
-            (None, None) => (Level::Stale, "no odometry yet".into()),
-            (_, Some(reason)) => (Level::Error, format!("refused: {reason}")),
-            (Some(at), None) if at.elapsed() > SILENT_AFTER => {
-                (Level::Stale, format!("no odometry for {:.1} s", at.elapsed().as_secs_f64()))
+        let refused = self.unopened.as_ref().or(self.refused.as_ref()).or(self.command_refused.as_ref());
+        let Some(moved) = self.moved else {
+            return refused.map_or((Level::Stale, "no odometry yet".into()), |reason| (Level::Error, format!("refused: {reason}")));
+        };
+        if moved.elapsed() > SILENT_AFTER {
+            let before = refused.map_or(String::new(), |reason| format!("; before that refused: {reason}"));
+            return (Level::Stale, format!("no odometry for {:.1} s{before}", moved.elapsed().as_secs_f64()));
+        }
+        match (refused, self.gap_s) {
+            (Some(reason), _) => (Level::Error, format!("refused: {reason}")),
+            (None, Some(gap_s)) => {
+                let reason = "the history begins anew after each pause, and predictions and soil with it";
+                (Level::Warn, format!("odometry comes too seldom: {gap_s:.2} s passed before the last one; {reason}"))
             }
-            (Some(_), None) if !self.commanded => (Level::Warn, "no command holds: taken as told to stand".into()),
-            (Some(_), None) => (Level::Ok, "measurements are taken".into()),
+            _ if !self.commanded => (Level::Warn, "no command holds: taken as told to stand".into()),
+            _ => (Level::Ok, "measurements are taken".into()),
         }
     }
 
@@ -99,11 +113,12 @@ impl Machine {
         match finite {
             Ok(command) => {
                 heard.command = Some((command, Instant::now()));
+                heard.command_refused = None;
                 heard.count("command");
             }
             Err(error) => {
                 heard.count("command_refused");
-                heard.refused = Some(error.to_string());
+                heard.command_refused = Some(error.to_string());
             }
         }
     }
@@ -154,13 +169,16 @@ impl Machine {
         let mut heard = self.state();
         heard.moved = Some(Instant::now());
         heard.count(label);
-        heard.refused = match result {
-            Ok(measured) if measured.outcome.accepted() => None,
+        match result {
+            // It was taken before; nothing is amiss.
+            Ok(MeasureAnswer { outcome: Outcome::Duplicate, .. }) => {}
             Ok(measured) => {
-                Some(format!("the last measurement is {label}, see nesam.v1.MeasurementAnswer; {} were taken", measured.accepted))
+                heard.unopened = None;
+                heard.refused = why_refused(&measured.outcome).map(|why| format!("{why}; {} were taken", measured.accepted));
+                heard.gap_s = if let Outcome::Gap { gap_s } = measured.outcome { Some(gap_s) } else { None };
             }
-            Err(error) => Some(error.to_string()),
-        };
+            Err(error) => heard.refused = Some(error.to_string()),
+        }
     }
 
     /// Opens the session where none is open. What follows waits behind it.
@@ -197,10 +215,25 @@ impl Machine {
     }
 
     fn opened(&self, refused: Option<String>) {
-        match refused {
-            None => tracing::info!(session = self.config.vehicle, "session opened for a machine of ROS 2"),
-            Some(reason) => self.state().refused = Some(format!("the session cannot be opened: {reason}")),
+        let session = &self.config.vehicle;
+        let unopened = refused.map(|reason| format!("the session cannot be opened: {reason}"));
+        let before = core::mem::replace(&mut self.state().unopened, unopened.clone());
+        match unopened {
+            None => tracing::info!(session, "session opened for a machine of ROS 2"),
+            // Each odometry tries again.
+            Some(reason) if before.as_ref() != Some(&reason) => tracing::warn!(session, reason, "a machine of ROS 2 is not heard"),
+            Some(_) => {}
         }
+    }
+}
+
+/// Why a measurement was refused; `None` where it was taken.
+fn why_refused(outcome: &Outcome) -> Option<String> {
+    match outcome {
+        Outcome::TooOld { behind_s } => Some(format!("the odometry is {behind_s:.3} s too old")),
+        Outcome::NotFinite { field } => Some(format!("`{field}` of the odometry is NaN or infinite")),
+        Outcome::Future { ahead_s } => Some(format!("the stamp of the odometry lies {ahead_s:.3} s ahead of where time can be")),
+        _ => None,
     }
 }
 

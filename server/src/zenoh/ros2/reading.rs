@@ -6,6 +6,9 @@ use nesam_physics::vec3::attitude_of_quaternion;
 use nesam_physics::{Control, SecondCommand, Vehicle, VehicleState};
 use nesam_ros2::messages::{Command, CommandType, Odometry};
 
+/// Least speed with which the yaw rate of a twist is made an angle, m/s: below it noise would be full lock.
+const SLOW_M_S: f64 = 0.3;
+
 /// State of the reference point of the card, which lies at `reference_m` in the child frame of the odometry. Child frame is Body, its frame World (REP-103).
 ///
 /// # Errors
@@ -26,13 +29,13 @@ pub fn state(odometry: &Odometry, reference_m: [f64; 3]) -> Result<VehicleState<
 
 /// A command as the card has it, and whether it was beyond the card's range, where the vehicle does what it can.
 ///
-/// The yaw rate of a twist is the angle with which a vehicle of this wheelbase turns so at its speed (kinematic bicycle), straight ahead where it stands.
+/// The yaw rate of a twist is the angle with which a vehicle of this wheelbase turns so at its speed (kinematic bicycle), the speed taken as 0.3 m/s at least,
+/// as clients do.
 pub fn control(kind: CommandType, vehicle: &Vehicle, command: &Command) -> (Control<f64>, bool) {
     let Command { speed_m_s, turn, .. } = *command;
     let angle_rad = match kind.is_steered() {
         true => turn,
-        false if speed_m_s == 0.0 => 0.0,
-        false => (vehicle.wheelbase_m * turn / speed_m_s).atan(),
+        false => (vehicle.wheelbase_m * turn / speed_m_s.abs().max(SLOW_M_S).copysign(speed_m_s)).atan(),
     };
     let second = match vehicle.second {
         SecondCommand::YawRateRadS => turn,

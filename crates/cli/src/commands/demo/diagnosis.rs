@@ -55,6 +55,7 @@ fn of_set(predictor: &Predictor, data: DataArgs, show: &dyn Fn(Value)) -> Result
         dt_s,
         against,
         doubts: &[],
+        notes: &[],
     };
     show(serde_json::from_str(&report.to_json()).unwrap_or_default());
     let position: Vec<Option<f64>> = found.scores.iter().flat_map(|s| s.scores.iter().map(|m| m.summary.tree.position_m.mean)).collect();

@@ -4,15 +4,16 @@ use std::path::PathBuf;
 
 use clap::Args;
 use nesam_engine::Measurement;
+use nesam_evaluation::report::Short;
 use nesam_model::ModelBundle;
 use nesam_model::bundle::sha256_hex;
 use nesam_server::recording::{RecordedWindow, Recording, RecordingError, RecordingHeader, window};
-use nesam_trajectories::{Report, drives_of_reports};
+use nesam_trajectories::{Report, drives_of_reports, has_a_piece};
 
 use super::{Input, ReferenceArg, reference};
 use crate::args::BundleArgs;
 use crate::failure::{Failure, OrFail};
-use crate::output::{self, note, say};
+use crate::output::{self, note};
 use crate::sources::{load_recorded_bundle, maps_hash};
 
 /// Pieces of a recording that stand for drives.
@@ -23,8 +24,8 @@ const PIECES_OF_THE_MODEL: usize = 10;
 /// Options that take the drives from a recording.
 #[derive(Args, Debug)]
 pub struct RecordingArgs {
-    /// Diagnose what a server recorded of a session instead of a set: files of recordings, or their folder; of several it is the newest that has the
-    /// session in the window. Without --bundle it is the recorded bundle, found by its hash in deploy/bundles
+    /// Diagnose what a server recorded of a session instead of a set: files of recordings, or their folder; of several it is the newest that has
+    /// enough of the session in the window. Without --bundle it is the recorded bundle, found by its hash in deploy/bundles
     #[arg(long, value_name = "PATH", num_args = 1.., requires = "session", conflicts_with_all = ["data", "set", "trajectories", "vehicle", "dt"])]
     pub recording: Vec<PathBuf>,
     /// Session to diagnose
@@ -66,46 +67,70 @@ impl RecordingArgs {
             ReferenceArg::Bundle => PIECES,
             ReferenceArg::Physics => PIECES_OF_THE_MODEL,
         });
-        let reports: Vec<Report> = window.measurements.iter().map(report).collect();
+        let reports = reports(&window);
         let drives = drives_of_reports(session, &reports, bundle.normalization.dt_s, pieces);
         if drives.is_empty() {
             return Err(Failure::input(format!("session `{session}` has no 4 s of measurements without a pause in this window")));
         }
         let seconds: f64 = drives.iter().map(|d| d.time_s.last().copied().unwrap_or(0.0)).sum();
-        say!(
+        let of_pieces = format!(
             "session {session}: {} measurements, {seconds:.1} s in {} pieces of one recording; pieces share ground and driver, so this is weaker evidence than \
              that many drives",
             reports.len(),
             drives.len()
         );
+        let notes: Vec<String> = [of_pieces].into_iter().chain(applied_note(session, &window.applied)).collect();
+        notes.iter().for_each(|text| note!("note: {text}"));
         let numbers = reports.iter().flat_map(|r| r.state.to_array().into_iter().chain([r.time_s, r.command.speed_m_s, r.command.second]));
         let data_hash = sha256_hex(&numbers.flat_map(f64::to_le_bytes).collect::<Vec<u8>>());
         let maps = vec![window.map; drives.len()];
         let provenance = output::provenance_of(Some(&bundle), &data_hash, &maps_hash(&maps));
         let predictor = std::sync::Arc::new(nesam_model::Predictor::new(std::sync::Arc::new(bundle)).or_input()?);
-        Ok(Input { set: format!("recording-{session}"), drives, maps, data_hash, predictor, provenance, short: Vec::new() })
+        Ok(Input { set: format!("recording-{session}"), drives, maps, data_hash, predictor, provenance, short: Vec::new(), notes })
     }
 
-    /// What a session measured in the newest recording that has something of it in the window; where none has, what the newest says.
+    /// What a session measured in the newest recording that has enough of it in the window for a diagnosis; where none has, the newest with something, else
+    /// what the newest says.
     fn newest_with(&self, session: &str, recordings: Vec<Recording>) -> Result<(RecordingHeader, RecordedWindow), Failure> {
         let count = recordings.len();
-        let mut otherwise = None;
+        let (mut with_little, mut otherwise) = (None, None);
         for mut recording in recordings.into_iter().rev() {
             let header = recording.header().clone();
             match window(&mut recording, session, self.from_ns, self.to_ns) {
-                Ok(window) if !window.measurements.is_empty() => {
-                    if count > 1 {
-                        note!("note: {} is diagnosed, the newest of {count} recordings with this session in the window", header.run);
-                    }
-                    return Ok((header, window));
+                Ok(window) if has_a_piece(&reports(&window)) => {
+                    with_little = Some((header, window));
+                    break;
                 }
+                Ok(window) if !window.measurements.is_empty() => with_little = with_little.or(Some((header, window))),
                 Ok(window) => otherwise = otherwise.or(Some(Ok((header, window)))),
                 Err(error @ RecordingError::NoSession { .. }) => otherwise = otherwise.or(Some(Err(error))),
                 Err(error) => return Err(error).or_input(),
             }
         }
+        if let Some((header, window)) = with_little {
+            if count > 1 {
+                note!("note: {} is diagnosed, of {count} recordings the newest with enough of this session in the window", header.run);
+            }
+            return Ok((header, window));
+        }
         otherwise.expect("there is at least one recording; this is a bug").or_input()
     }
+}
+
+/// What effects that were applied to a session mean for its diagnosis.
+fn applied_note(session: &str, applied: &[(String, Vec<(String, f64)>)]) -> Option<String> {
+    let one = |(id, parameters): &(String, Vec<(String, f64)>)| {
+        let values: Vec<String> = parameters.iter().map(|(name, value)| format!("{name}={}", Short(*value))).collect();
+        format!("{id}:{}", values.join(","))
+    };
+    let effects: Vec<String> = applied.iter().map(one).collect();
+    (!effects.is_empty()).then(|| {
+        format!(
+            "the session predicts with {} applied; this is measured against the bundle alone, so that what is found takes the place of that, and where \
+             nothing is found it is to be taken away (`nesam effects revert --session={session}`)",
+            effects.join(" ")
+        )
+    })
 }
 
 /// The bundle of the recording, or the given one where it is of the same vehicle.
@@ -127,6 +152,10 @@ fn recorded_bundle(args: &BundleArgs, header: &RecordingHeader) -> Result<ModelB
         );
     }
     Ok(bundle)
+}
+
+fn reports(window: &RecordedWindow) -> Vec<Report> {
+    window.measurements.iter().map(report).collect()
 }
 
 fn report(m: &Measurement) -> Report {
