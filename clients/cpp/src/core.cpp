@@ -78,6 +78,7 @@ Result<SessionStatus> Core::session(const std::string& id, Timeout timeout) cons
 
 SessionStatus Core::opened(const v1::Session& session) const {
   known_states.opened(session.session_id());
+  openings.opened(session.session_id());
   return from_message(session);
 }
 
@@ -87,6 +88,7 @@ Result<void> Core::close(const std::string& id, Timeout timeout) const {
   auto reply = call(*sessions, &v1::Sessions::Stub::Close, request, timeout);
   if (!reply) return reply.error();
   known_states.forget(id);
+  openings.closed(id);
   return {};
 }
 

@@ -12,6 +12,7 @@
 #include <nesam/client.hpp>
 
 #include "known_states.hpp"
+#include "openings.hpp"
 #include "nesam/v1/diagnosis.grpc.pb.h"
 #include "nesam/v1/measurements.grpc.pb.h"
 #include "nesam/v1/prediction.grpc.pb.h"
@@ -49,6 +50,7 @@ class Core {
   template <class Stub, class Request, class Reply>
   Result<Reply> call(Stub& stub, grpc::Status (Stub::*method)(grpc::ClientContext*, const Request&, Reply*), const Request& request,
                      Timeout timeout) const {
+    if (!names_vehicle()) return Error(Code::invalid_argument, "vehicle_id", "must be 1 to 64 of A-Z a-z 0-9 _ . -");
     grpc::ClientContext context;
     introduce(context);
     context.set_deadline(deadline(timeout.value_or(options.timeout)));
@@ -63,7 +65,13 @@ class Core {
 
   /// Tells a proxy which vehicle a call is about.
   void introduce(grpc::ClientContext& context) const {
-    if (!options.vehicle_id.empty()) context.AddMetadata("x-vehicle-id", options.vehicle_id);
+    if (!options.vehicle_id.empty() && names_vehicle()) context.AddMetadata("x-vehicle-id", options.vehicle_id);
+  }
+
+  /// Whether the vehicle of the options is none or has a name that the service takes: gRPC ends the process for metadata of other characters.
+  bool names_vehicle() const {
+    const auto allowed = [](char c) { return (c >= '0' && c <= '9') || (c >= 'A' && c <= 'Z') || (c >= 'a' && c <= 'z') || c == '_' || c == '.' || c == '-'; };
+    return options.vehicle_id.size() <= 64 && std::all_of(options.vehicle_id.begin(), options.vehicle_id.end(), allowed);
   }
 
   static std::chrono::system_clock::time_point deadline(std::chrono::nanoseconds timeout) {
@@ -93,6 +101,8 @@ class Core {
   const std::unique_ptr<v1::Diagnosis::Stub> diagnosis;
   /// Guards itself; what is known of a session is no setting of the connection.
   mutable KnownStates known_states;
+  /// Guards itself.
+  mutable Openings openings;
 };
 
 }  // namespace nesam::detail

@@ -50,7 +50,8 @@ Session::~Session() {
   if (!impl_) return;
   try {
     impl_->stream.reset();
-    if (impl_->owned) (void)impl_->core->close(impl_->id, impl_->core->options.close_timeout);
+    const bool is_newest = impl_->core->openings.newest(impl_->id) == impl_->opening;
+    if (impl_->owned && is_newest) (void)impl_->core->close(impl_->id, impl_->core->options.close_timeout);
   } catch (...) {
     // Only want of memory gets here; the server forgets the session when it stops.
   }

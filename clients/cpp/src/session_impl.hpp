@@ -1,5 +1,6 @@
 #pragma once
 
+#include <cstdint>
 #include <memory>
 #include <mutex>
 #include <optional>
@@ -12,11 +13,13 @@ namespace nesam::detail {
 /// What a `Session` owns.
 struct SessionImpl {
   SessionImpl(std::shared_ptr<Core> connection, SessionStatus&& status)
-      : core(std::move(connection)), id(std::move(status.session_id)), vehicle(std::move(status.vehicle)) {}
+      : core(std::move(connection)), id(std::move(status.session_id)), vehicle(std::move(status.vehicle)), opening(core->openings.newest(id)) {}
 
   const std::shared_ptr<Core> core;
   const std::string id;
   const VehicleCard vehicle;
+  /// The opening that it came from; a later one of the same name is another session, which whoever opened it closes.
+  const std::uint64_t opening;
 
   /// Guards what follows.
   std::mutex mutex;

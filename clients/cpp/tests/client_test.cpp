@@ -119,8 +119,25 @@ void service_sessions_are_raii(nesam::Client& client) {
     check(client.session(other.vehicle_id).ok(), "the session that replaced it is open");
   }
 
+  // As after a restart of the server: the session is gone, and the new one takes the place of the old object.
+  options.vehicle_id = unique("again");
+  {
+    auto session = client.open(options);
+    check(session.ok() && client.close(options.vehicle_id).ok(), "open and lost");
+    auto again = client.open(options);
+    if (session && again) *session = std::move(*again);
+    check(client.session(options.vehicle_id).ok(), "the old object does not close the session that was opened again");
+  }
+  check_error(client.session(options.vehicle_id), nesam::Code::not_found, "session_id", "the new object closes it");
+
   options.vehicle_id = "";
   check_error(client.open(options), nesam::Code::invalid_argument, "vehicle_id", "no name");
+  for (const char* wrong : {"truck-7\n", "Bj\xc3\xb6rn"}) {
+    nesam::ClientOptions of_nobody;
+    of_nobody.vehicle_id = wrong;
+    nesam::Client nobody("127.0.0.1:1", of_nobody);
+    check_error(nobody.session("truck-7"), nesam::Code::invalid_argument, "vehicle_id", "a vehicle that is no name");
+  }
   options.vehicle_id = unique("raii");
   options.map_id = "no-such-map";
   check_error(client.open(options), nesam::Code::not_found, "map_id", "an unknown map");

@@ -17,6 +17,7 @@ from ._connection import ATTEMPTS_MAX, Connected, Options, arguments, finite_tim
 from ._errors import InvalidArgument, NesamError
 from ._extras import Extras
 from ._fallback import KinematicFallback
+from ._given import vehicle_or_none
 from ._routing import HEADER
 from ._stream import ON_THE_WAY_MAX, OpenStream
 from .v1 import (
@@ -45,6 +46,7 @@ class AsyncClient(Connected):
     ):
         self.timeout_s = timeout_s
         options, credentials = arguments(address, tls)
+        vehicle_id = vehicle_or_none(vehicle_id)
 
         def opened(options: Options) -> Any:
             return grpc.aio.insecure_channel(address, options) if credentials is None else grpc.aio.secure_channel(address, credentials, options)

@@ -17,6 +17,7 @@ from ._durable import DurableStream
 from ._errors import InvalidArgument, NesamError
 from ._extras import Extras
 from ._fallback import KinematicFallback
+from ._given import vehicle_or_none
 from ._routing import VehicleHeader
 from ._stream import ON_THE_WAY_MAX, OpenStream
 from .v1 import (
@@ -38,7 +39,7 @@ class Client(Connected):
     vehicle_id: told with every call, for a proxy in front of several servers (deploy/haproxy); "" = not told.
     attempts_max: how often a call is tried that only reads (`session`, `sessions`, `export_session`, `map`, `maps`, `fleet_soil`, `predict`) and is UNAVAILABLE, 1 to 5;
     1 = once. The pauses between them grow from 0.1 s to 1 s, together about 2 s; all is over by the deadline of the call. A prediction with a fallback is tried
-    once, and so is all that changes something. ValueError for another number, or an address that begins with http or has no port.
+    once, and so is all that changes something. ValueError for another number, a vehicle_id that is no name, or an address that begins with http or has no port.
 
     What is asked of a client that is closed, or was on its way when it was, is Unavailable.
 
@@ -52,6 +53,7 @@ class Client(Connected):
     ):
         self.timeout_s = timeout_s
         options, credentials = arguments(address, tls)
+        vehicle_id = vehicle_or_none(vehicle_id)
 
         def opened(options: Options) -> Any:
             channel = grpc.insecure_channel(address, options) if credentials is None else grpc.secure_channel(address, credentials, options)

@@ -150,3 +150,14 @@ def test_service_a_tile_that_is_too_large_says_how_it_goes(client, server_addres
         assert refused.value.field == "elevation_m"
     assert client.patch_tile("wide", 1, 0, 0, elevation[:500], rgb[:500]).version == 2
     assert client.upload_map(nesam.WorldMap("wide", elevation, 0.1, semantic_rgb=rgb, version=3)).version == 3
+
+
+@pytest.mark.parametrize("kind", [nesam.Client, nesam.AsyncClient])
+def test_property_a_vehicle_that_is_no_name_is_refused(kind):
+    async def opened(vehicle_id):
+        return kind("127.0.0.1:1", vehicle_id=vehicle_id)
+
+    for wrong in ("truck-7\n", "Björn", "a b", "x" * 65):
+        with pytest.raises(ValueError, match="vehicle_id"):
+            asyncio.run(opened(wrong))
+    asyncio.run(opened("truck-7"))
