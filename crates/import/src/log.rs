@@ -2,6 +2,8 @@
 
 use std::path::PathBuf;
 
+use crate::error::ImportError;
+
 /// A log. All columns have one entry per row; `None` = the row has no such value.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Log {
@@ -36,6 +38,20 @@ impl Log {
         self.all_names().any(|held| held == name)
     }
 
+    /// Forgets columns.
+    ///
+    /// # Errors
+    /// `ImportError::Log` for a name that it does not have.
+    pub fn leave_out(&mut self, names: &[String]) -> Result<(), ImportError> {
+        if let Some(unknown) = names.iter().find(|name| !self.holds(name)) {
+            let reason = format!("has no column or channel `{unknown}` to leave out; there are {}", self.names());
+            return Err(ImportError::log(&self.path, reason));
+        }
+        self.numbers.retain(|(held, _)| !names.contains(held));
+        self.texts.retain(|(held, _)| !names.contains(held));
+        Ok(())
+    }
+
     /// Names of all columns, for errors.
     pub fn names(&self) -> String {
         self.all_names().collect::<Vec<_>>().join(", ")
@@ -43,5 +59,20 @@ impl Log {
 
     fn all_names(&self) -> impl Iterator<Item = &str> {
         self.numbers.iter().map(|(n, _)| n.as_str()).chain(self.texts.iter().map(|(n, _)| n.as_str()))
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn analytic_what_is_left_out_was_never_there() {
+        let numbers = ["t", "vbx", "vby"].map(|name| (name.to_string(), vec![Some(0.0)])).to_vec();
+        let mut log = Log { rows: 1, numbers, texts: vec![("note".into(), vec!["a".into()])], ..Log::default() };
+        let refused = log.leave_out(&["vbx".into(), "vbz".into()]).unwrap_err().to_string();
+        assert!(refused.contains("`vbz`") && refused.contains("t, vbx, vby, note") && log.holds("vbx"), "{refused}");
+        log.leave_out(&["vbx".into(), "note".into()]).unwrap();
+        assert_eq!(log.names(), "t, vby");
     }
 }

@@ -43,6 +43,9 @@ pub struct ImportArgs {
     /// File with one such line per column
     #[arg(long, value_name = "FILE")]
     columns: Option<PathBuf>,
+    /// Columns of tables, or channels of bags (x, …, vbx, vby, vbz, wx, wy, wz), that are not to be read: `vbx,vby,wz` of an odometry without a twist
+    #[arg(long, value_name = "NAME,…", value_delimiter = ',')]
+    leave_out: Vec<String>,
     /// Axes of the log
     #[arg(long, value_enum, default_value_t = FrameArg::EnuFlu)]
     frame: FrameArg,
@@ -216,7 +219,7 @@ fn read(args: &ImportArgs, log: &Path, mapping: &Mapping) -> Result<Vec<Drive>, 
     if std::fs::metadata(log).is_ok_and(|file| file.is_file() && file.len() == 0) {
         return Err(Failure::input(format!("{}: is empty: nothing was recorded, or it was not copied", log.display())));
     }
-    let (table, mut notes) = match kind.as_str() {
+    let (mut table, mut notes) = match kind.as_str() {
         "mcap" => {
             let topics = Topics { odometry: args.odometry.clone(), command: args.command.clone(), imu: args.imu.clone() };
             read_bag(log, &topics).or_input()?
@@ -226,6 +229,7 @@ fn read(args: &ImportArgs, log: &Path, mapping: &Mapping) -> Result<Vec<Drive>, 
         }
         _ => (read_csv(log).or_input()?, Vec::new()),
     };
+    table.leave_out(&args.leave_out).or_input()?;
     let frame = match args.frame {
         FrameArg::EnuFlu => FrameConvention::EnuFlu,
         FrameArg::NedFrd => FrameConvention::NedFrd,

@@ -117,7 +117,10 @@ impl Relation {
         let most = high.max(-low);
         if low <= 0.0 && high >= 0.0 && most < NOTHING {
             let what = format!("{about}: at most {most:.3} times as much as expected, {count}");
-            return Some(doubt(what, "nothing moved, or a channel of zeros was recorded: see what it was read from, or leave it out"));
+            return Some(doubt(
+                what,
+                "nothing moved, or a channel of zeros was recorded: see what it was read from, or leave it out (`--leave-out`)",
+            ));
         }
         if low < 0.0 && high > 0.0 {
             let what = format!("{about}: unrelated, {low:.2} to {high:.2} times as much as expected in the middle half, {count}");
