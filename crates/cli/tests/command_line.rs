@@ -9,7 +9,7 @@ use std::path::{Path, PathBuf};
 use std::process::{Command, Stdio};
 use std::sync::OnceLock;
 
-use common::{bundle, nesam, refused, repository, sample, stderr, stdout};
+use common::{bundle, nesam, refused, repository, said, sample, stderr, stdout};
 use serde_json::Value;
 
 fn copy_folder(from: &Path, to: &Path) {
@@ -737,4 +737,25 @@ fn service_bench_plant_scores_what_a_diagnosis_makes_of_a_hidden_effect() {
     let (size, estimate) = (run["size"].as_f64().unwrap(), run["estimate"].as_f64().unwrap());
     assert_eq!(run["named"][0][0], "gyro_bias", "{run}");
     assert!((estimate / size - 1.0).abs() < 0.15, "{estimate} of {size}");
+}
+
+/// Goal: a card can be checked before there is any log. Method: the card of the sample as it is, in tonnes, and without its wheels.
+#[test]
+fn service_a_vehicle_card_is_checked_by_itself() {
+    let sample = std::fs::read_to_string(repository().join("tests/data/chrono_sample/vehicle_hmmwv.json")).unwrap();
+    let here = tempfile::tempdir().unwrap();
+    let check = |text: &str| {
+        std::fs::write(here.path().join("card.json"), text).unwrap();
+        let output = nesam(&["check", "card.json"], here.path());
+        (output.status.code(), said(&output))
+    };
+    let (code, sound) = check(&sample);
+    assert!(code == Some(0) && sound.contains("(vehicle card)") && sound.contains("sound"), "{sound}");
+    let card: Value = serde_json::from_str(&sample).unwrap();
+    let mut tonnes = card.clone();
+    tonnes["mass_total"] = (card["mass_total"].as_f64().unwrap() / 1000.0).into();
+    let (code, doubted) = check(&tonnes.to_string());
+    assert!(code == Some(0) && doubted.contains("doubt: card of") && doubted.contains("kg"), "{doubted}");
+    let (code, refused) = check("{}");
+    assert!(code == Some(2) && refused.contains("missing"), "{refused}");
 }

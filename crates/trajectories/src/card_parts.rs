@@ -10,7 +10,7 @@ use crate::json::JsonFile;
 const OF_WHEEL: [&str; 4] = ["tyre.mass", "wheel.mass", "hub_spindle.mass", "upright.mass"];
 
 /// Mass of the chassis and of four wheels, as far as the card states them, kg; `None` where it states none.
-pub(crate) fn mass_of_parts_kg(card: &Path) -> Option<f64> {
+pub fn mass_of_parts_kg(card: &Path) -> Option<f64> {
     let sheet = JsonFile::read(card).ok()?;
     let stated = |key: &str| sheet.number(&[key]).ok().flatten();
     let per_wheel = stated("unsprung_mass_per_wheel").or_else(|| OF_WHEEL.into_iter().filter_map(stated).reduce(|a, b| a + b));

@@ -63,6 +63,14 @@ pub fn read_vehicle_card(path: &Path) -> Result<Vehicle, TrajectoryError> {
     read_with_notes(path, &|| None).map(|card| card.vehicle)
 }
 
+/// The same with what the card leaves out and is estimated, one sentence each.
+///
+/// # Errors
+/// As [`read_vehicle_card`].
+pub fn read_vehicle_card_with_notes(path: &Path) -> Result<(Vehicle, Vec<String>), TrajectoryError> {
+    read_with_notes(path, &|| None).map(|card| (card.vehicle, card.notes))
+}
+
 /// A vehicle card that was read.
 pub(crate) struct CardReading {
     pub(crate) vehicle: Vehicle,

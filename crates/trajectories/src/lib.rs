@@ -30,10 +30,11 @@ mod trajectory;
 mod velocity;
 mod windows;
 
+pub use card_parts::mass_of_parts_kg;
 pub use command_range::BeyondRange;
 pub use commands::commands_from_csv;
 pub use data_root::{DataRoot, SetQuery, SplitFilter};
-pub use data_sheet::{card_from_json, card_to_json, read_vehicle_card};
+pub use data_sheet::{card_from_json, card_to_json, read_vehicle_card, read_vehicle_card_with_notes};
 pub use error::TrajectoryError;
 pub use ground_truth::GroundTruth;
 pub use limited_start::limited_starts;

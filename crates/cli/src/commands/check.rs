@@ -7,7 +7,8 @@ use nesam_evaluation::Baselines;
 use nesam_import::{Doubt, card_doubts, doubts, recorded_doubts};
 use nesam_model::bundle::MANIFEST;
 use nesam_model::{ModelBundle, Predictor};
-use nesam_trajectories::DataRoot;
+use nesam_physics::Vehicle;
+use nesam_trajectories::{DataRoot, mass_of_parts_kg, read_vehicle_card_with_notes};
 use serde_json::{Value, json};
 
 use crate::args::{DataArgs, SplitArg};
@@ -22,7 +23,7 @@ const PREDICTED_MIN: usize = 10;
 /// Options of `nesam check`.
 #[derive(Args, Debug)]
 pub struct CheckArgs {
-    /// Data roots, bundles or configuration files
+    /// Data roots, bundles, vehicle cards (.json) or configuration files
     #[arg(value_name = "PATH", required = true)]
     paths: Vec<PathBuf>,
     /// Vehicle card, when a data root has none of its own
@@ -103,7 +104,10 @@ pub fn run(args: &CheckArgs) -> Result<(), Failure> {
 }
 
 fn check(path: &Path, card: Option<&Path>, findings: &mut Findings) -> &'static str {
-    if path.is_file() {
+    if path.is_file() && path.extension().is_some_and(|extension| extension.eq_ignore_ascii_case("json")) {
+        vehicle_card(path, findings);
+        "vehicle card"
+    } else if path.is_file() {
         configuration(path, findings);
         "configuration"
     } else if path.join(MANIFEST).is_file() {
@@ -149,6 +153,21 @@ fn says_nothing(text: &str) -> bool {
     text.lines().map(str::trim).all(|line| line.is_empty() || line.starts_with('#'))
 }
 
+fn vehicle_card(path: &Path, findings: &mut Findings) {
+    match read_vehicle_card_with_notes(path) {
+        Err(e) => findings.error(chain(&e)),
+        Ok((vehicle, notes)) => {
+            notes.into_iter().for_each(|note| findings.note(note));
+            of_card(&vehicle, mass_of_parts_kg(path), findings);
+        }
+    }
+}
+
+fn of_card(vehicle: &Vehicle, mass_of_parts_kg: Option<f64>, findings: &mut Findings) {
+    let doubts = card_doubts(vehicle, mass_of_parts_kg);
+    doubts.iter().for_each(|doubt| findings.doubt(&format!("card of `{}`", vehicle.name), doubt));
+}
+
 fn data_root(path: &Path, card: Option<&Path>, findings: &mut Findings) {
     let root = match DataRoot::open(path, card) {
         Ok(root) => root,
@@ -157,8 +176,7 @@ fn data_root(path: &Path, card: Option<&Path>, findings: &mut Findings) {
     if root.vehicle().inertia_estimated {
         findings.note(format!("card of `{}` gives no inertia: a box estimate is used", root.vehicle().name));
     }
-    let doubts = card_doubts(root.vehicle(), root.mass_of_parts_kg());
-    doubts.iter().for_each(|doubt| findings.doubt(&format!("card of `{}`", root.vehicle().name), doubt));
+    of_card(root.vehicle(), root.mass_of_parts_kg(), findings);
     if root.sets().is_empty() {
         findings.error("no set: no folder with samples.parquet");
     }

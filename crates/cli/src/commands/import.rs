@@ -227,7 +227,14 @@ fn read(args: &ImportArgs, log: &Path, mapping: &Mapping) -> Result<Vec<Drive>, 
         "db3" | "bag" | "zstd" => {
             return Err(Failure::input(format!("{}: {CONVERT}", log.display())));
         }
-        _ => (read_csv(log).or_input()?, Vec::new()),
+        _ => {
+            let of_bags = [("--odometry", &args.odometry), ("--command", &args.command), ("--imu", &args.imu)];
+            if let Some((option, _)) = of_bags.into_iter().find(|(_, topic)| topic.is_some()) {
+                let reason = "names a topic of a bag, and this is a table, whose columns `--column` names; import tables and bags apart";
+                return Err(Failure::input(format!("{}: {option} {reason}", log.display())));
+            }
+            (read_csv(log).or_input()?, Vec::new())
+        }
     };
     table.leave_out(&args.leave_out).or_input()?;
     let frame = match args.frame {
