@@ -14,7 +14,7 @@ Client& Client::operator=(Client&&) noexcept = default;
 Client::~Client() = default;
 
 Result<void> Client::connect(std::chrono::nanoseconds timeout) {
-  if (!core_->names_vehicle()) return Error(Code::invalid_argument, "vehicle_id", "must be 1 to 64 of A-Z a-z 0-9 _ . -");
+  if (auto wrong = core_->wrong_vehicle()) return *wrong;
   if (core_->channel->WaitForConnected(detail::Core::deadline(timeout))) return {};
   return Error(Code::deadline_exceeded, "", "no connection to the server in time");
 }

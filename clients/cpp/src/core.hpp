@@ -4,6 +4,7 @@
 #include <chrono>
 #include <cstdint>
 #include <memory>
+#include <optional>
 #include <string>
 #include <system_error>
 
@@ -50,7 +51,7 @@ class Core {
   template <class Stub, class Request, class Reply>
   Result<Reply> call(Stub& stub, grpc::Status (Stub::*method)(grpc::ClientContext*, const Request&, Reply*), const Request& request,
                      Timeout timeout) const {
-    if (!names_vehicle()) return Error(Code::invalid_argument, "vehicle_id", "must be 1 to 64 of A-Z a-z 0-9 _ . -");
+    if (auto wrong = wrong_vehicle()) return *wrong;
     grpc::ClientContext context;
     introduce(context);
     context.set_deadline(deadline(timeout.value_or(options.timeout)));
@@ -65,13 +66,16 @@ class Core {
 
   /// Tells a proxy which vehicle a call is about.
   void introduce(grpc::ClientContext& context) const {
-    if (!options.vehicle_id.empty() && names_vehicle()) context.AddMetadata("x-vehicle-id", options.vehicle_id);
+    if (!options.vehicle_id.empty() && !wrong_vehicle()) context.AddMetadata("x-vehicle-id", options.vehicle_id);
   }
 
-  /// Whether the vehicle of the options is none or has a name that the service takes: gRPC ends the process for metadata of other characters.
-  bool names_vehicle() const {
+  /// Why the vehicle of the options is no name that the service takes; none where it is one, or none is given. gRPC ends the process for metadata of other
+  /// characters.
+  std::optional<Error> wrong_vehicle() const {
     const auto allowed = [](char c) { return (c >= '0' && c <= '9') || (c >= 'A' && c <= 'Z') || (c >= 'a' && c <= 'z') || c == '_' || c == '.' || c == '-'; };
-    return options.vehicle_id.size() <= 64 && std::all_of(options.vehicle_id.begin(), options.vehicle_id.end(), allowed);
+    const std::string& name = options.vehicle_id;
+    if (name.size() <= 64 && std::all_of(name.begin(), name.end(), allowed)) return std::nullopt;
+    return Error(Code::invalid_argument, "vehicle_id", "must be 1 to 64 of A-Z a-z 0-9 _ . -");
   }
 
   static std::chrono::system_clock::time_point deadline(std::chrono::nanoseconds timeout) {

@@ -320,6 +320,11 @@ pub fn provenance_of(bundle: Option<&ModelBundle>, data_hash: &str, maps_hash: &
     }
 }
 
+/// Heads of the columns of errors by dimension and of the position, each so wide.
+pub fn error_heads(width: usize) -> String {
+    ["x m", "y m", "z m", "roll °", "pitch °", "yaw °", "pos. m"].map(|name| format!("{name:>width$}")).concat()
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;

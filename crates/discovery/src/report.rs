@@ -234,7 +234,7 @@ impl Report<'_> {
                 d.selection.threshold
             ))
             .table(&self.hypothesis_table());
-        for apart in d.findings.iter().filter(|finding| finding.refused.is_none()).filter_map(to_tell_apart) {
+        for apart in to_tell_apart(d) {
             page.text(&apart);
         }
         if !d.estimates.is_empty() && d.verdict.claims() {
@@ -342,7 +342,7 @@ impl Report<'_> {
 
     fn estimate_table(&self) -> Table {
         let mut table = Table::new("Parameters with 95 % intervals", &["effect", "parameter", "value", "interval", "unit"]);
-        for finding in self.diagnosis.findings.iter().filter(|finding| finding.refused.is_none()) {
+        for finding in named(self.diagnosis) {
             for e in &finding.estimates {
                 let interval = e.ci95.map_or("-".into(), |[l, h]| format!("[{}, {}]", Short(l), Short(h)));
                 let label = finding.candidate.label();
@@ -436,10 +436,17 @@ fn trace_plot(trace: &Trace) -> LinePlot {
     plot
 }
 
-/// What to drive so that an effect and its closest rival come apart, in words; `None` without a rival.
-pub fn to_tell_apart(finding: &Finding) -> Option<String> {
-    let (rival, manoeuvre) = (finding.rivals.first()?, manoeuvre::separating(finding)?);
-    Some(format!("to tell {} from {}: {manoeuvre}", finding.candidate.label(), rival.candidate.label()))
+/// What to drive so that each effect that was found and its closest rival come apart, in words.
+pub fn to_tell_apart(found: &Diagnosis) -> impl Iterator<Item = String> {
+    named(found).filter_map(|finding| {
+        let (rival, manoeuvre) = (finding.rivals.first()?, manoeuvre::separating(finding)?);
+        Some(format!("to tell {} from {}: {manoeuvre}", finding.candidate.label(), rival.candidate.label()))
+    })
+}
+
+/// Findings that were not refused.
+fn named(found: &Diagnosis) -> impl Iterator<Item = &Finding> {
+    found.findings.iter().filter(|finding| finding.refused.is_none())
 }
 
 /// An effect in words.

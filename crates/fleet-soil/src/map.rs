@@ -39,7 +39,7 @@ pub struct EvidenceParts {
 
 /// Other maps that are remembered at most; beyond, the one with the oldest evidence is forgotten.
 const HEARD_MAX: usize = 64;
-/// Share of all cells that is forgotten at a time, so that a full map is not searched for each increment.
+/// One in so many cells is forgotten at a time, so that a full map is not searched for each increment.
 const FORGOTTEN_AT_ONCE: usize = 64;
 /// Share of its weight below which evidence of another map is not taken any more.
 const FADED: f64 = 1e-3;
@@ -199,14 +199,14 @@ impl FleetSoilMap {
         if faded || evidence.stamp_s <= self.forgotten_s || known.is_some_and(|known| known.revision >= evidence.revision) {
             return false;
         }
-        self.heard.entry(of.into()).or_default().insert(key, *evidence);
+        self.heard.entry(of.into()).or_default().insert(key.clone(), *evidence);
         self.limit();
         if self.heard.len() > HEARD_MAX {
             let newest = |cells: &Cells| cells.values().map(CellEvidence::stamp_s).fold(f64::NEG_INFINITY, f64::max);
             let oldest = self.heard.iter().min_by(|a, b| newest(a.1).total_cmp(&newest(b.1))).map(|(name, _)| name.clone());
             oldest.and_then(|name| self.heard.remove(&name));
         }
-        self.heard.contains_key(of)
+        self.heard.get(of).is_some_and(|cells| cells.contains_key(&key))
     }
 
     /// Forgets the oldest evidence beyond the number of cells, whoever it was brought to.

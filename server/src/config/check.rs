@@ -197,7 +197,7 @@ impl Config {
                 "zenoh.listen",
                 format!(
                     "`{endpoint}` is open to the network and knows no identities; with `tls.client_ca` listen on `tls/...`, or on loopback only \
-                 behind a router (`nesam router-config` writes its configuration)"
+                     behind a router (`nesam router-config` writes its configuration)"
                 ),
             ));
         }

@@ -19,8 +19,8 @@ use crate::convert::applied_effects;
 pub struct RecordedWindow {
     /// The map that the session drove on; `None` without one.
     pub map: Option<Arc<WorldMap>>,
-    /// Effects that the session predicts with at the end of the recording, applied over those of its bundle: id, and parameters with their values.
-    pub applied: Vec<(String, Vec<(String, f64)>)>,
+    /// Effects that the session predicts with at the end of the recording, applied over those of its bundle.
+    pub applied: Vec<AppliedEffect>,
     /// Accepted measurements, in the order of the openings of the session and the starts and clocks of the vehicle, then by stamp.
     pub measurements: Vec<Measurement>,
 }
@@ -105,8 +105,6 @@ pub fn window(recording: &mut Recording, session: &str, from_ns: i64, to_ns: i64
         line.measurements.sort_by_key(|m| m.stamp_ns);
     }
     let map = map_id.and_then(|id| maps.get(&id));
-    let parameters = |effect: AppliedEffect| (effect.id, effect.parameters.into_iter().map(|p| (p.name, p.value)).collect());
-    let applied = applied.into_iter().map(parameters).collect();
     Ok(RecordedWindow { map, applied, measurements: lines.into_iter().flat_map(|line| line.measurements).collect() })
 }
 

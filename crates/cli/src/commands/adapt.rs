@@ -25,7 +25,7 @@ use self::alternatives::{Scene, read_true_soils};
 use crate::args::{BundleArgs, CommandsArgs, DataArgs, SplitArg, TruthArg, WindowArgs};
 use crate::bundle_path::bundle_dir;
 use crate::failure::{Failure, OrFail};
-use crate::output::{note, say};
+use crate::output::{error_heads, note, say};
 use crate::progress::Progress;
 use crate::sources::{
     Drives, check_model_step, check_own_vehicle, load_bundle, load_bundle_for, parted_drives, predictor_for, read_drives,
@@ -402,7 +402,7 @@ fn updates_line(c: &Consistency, mapped: bool) -> String {
 type ErrorRow = (String, ErrorTree<f64>, Option<ErrorTree<[f64; 2]>>);
 
 fn print_errors(title: &str, rows: &[ErrorRow], last: bool) {
-    let head: String = ["x m", "y m", "z m", "roll °", "pitch °", "yaw °", "pos. m"].map(|name| format!("{name:>15}")).concat();
+    let head = error_heads(15);
     say!("{title:<32}{head}");
     for (name, value, interval) in rows {
         let values = value.row(last).map(|v| v.map_or(format!("{:>15}", "–"), |v| format!("{v:>15.3}"))).concat();

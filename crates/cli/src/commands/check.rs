@@ -164,6 +164,9 @@ fn vehicle_card(path: &Path, findings: &mut Findings) {
 }
 
 fn of_card(vehicle: &Vehicle, mass_of_parts_kg: Option<f64>, findings: &mut Findings) {
+    if vehicle.inertia_estimated {
+        findings.note(format!("card of `{}` gives no inertia: a box estimate is used", vehicle.name));
+    }
     let doubts = card_doubts(vehicle, mass_of_parts_kg);
     doubts.iter().for_each(|doubt| findings.doubt(&format!("card of `{}`", vehicle.name), doubt));
 }
@@ -173,9 +176,6 @@ fn data_root(path: &Path, card: Option<&Path>, findings: &mut Findings) {
         Ok(root) => root,
         Err(e) => return findings.error(chain(&e)),
     };
-    if root.vehicle().inertia_estimated {
-        findings.note(format!("card of `{}` gives no inertia: a box estimate is used", root.vehicle().name));
-    }
     of_card(root.vehicle(), root.mass_of_parts_kg(), findings);
     if root.sets().is_empty() {
         findings.error("no set: no folder with samples.parquet");

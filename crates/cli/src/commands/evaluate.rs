@@ -16,7 +16,7 @@ use super::coverage;
 use crate::args::{BundleArgs, DataArgs, InputsArg, SplitArg, TruthArg, WindowArgs};
 use crate::bundle_path::{baseline_bundles, bundles_in};
 use crate::failure::{Failure, OrFail};
-use crate::output::{note, say};
+use crate::output::{error_heads, note, say};
 use crate::progress::Progress;
 use crate::sources::{Drives, load_bundle, load_bundle_for, predictor_for, read_drives, rounded, training_drives, worlds_of};
 use crate::{interrupt, output};
@@ -338,16 +338,7 @@ fn print_table(e: &Evaluation<'_>) {
         e.truth.as_str()
     );
     for (title, last) in [("mean over the horizon", false), ("at the last step", true)] {
-        say!(
-            "\n{title:<22}{:>9}{:>9}{:>9}{:>9}{:>9}{:>9}{:>9}  95 % interval",
-            "x m",
-            "y m",
-            "z m",
-            "roll °",
-            "pitch °",
-            "yaw °",
-            "pos. m"
-        );
+        say!("\n{title:<22}{}  95 % interval", error_heads(9));
         for model in e.models {
             let (t, c) = (&model.summary.tree, &model.summary.ci95);
             let cells: String = t.row(last).map(|v| v.map_or("        –".into(), |v| format!("{v:9.3}"))).concat();

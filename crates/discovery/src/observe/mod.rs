@@ -403,9 +403,8 @@ impl ObservedDrive {
     /// physics says of them.
     pub fn driven_again(&self, bench: &Bench<'_>, effects: &[ScheduledEffect], drive: &mut Trajectory) {
         let dt_s = bench.stepping.dt_s;
-        let known: Vec<ScheduledEffect> = bench.late().collect();
-        let plain = self.reading(bench, &known);
-        let phases = bench.phases(&[&known, effects].concat());
+        let plain = self.reading(bench, &[]);
+        let phases = bench.phases(effects);
         let mut actuators = plain.actuators[0][0];
         let mut state = self.states[0];
         for (k, transition) in self.transitions.iter().enumerate() {

@@ -27,6 +27,7 @@ use nesam_adaptation::{Agreement, VELOCITY_DIM};
 use nesam_physics::CONTRADICTIONS;
 
 use super::alarm::{Alarm, AlarmKind};
+use crate::clock::seconds;
 
 /// Buffers in the window; the filter's buffers last a second.
 const WINDOW: usize = 12;
@@ -209,10 +210,10 @@ impl Watch {
     fn alarm(&self, raised: &Reading) -> Alarm {
         let since = self.window.range(raised.onset..);
         let mean = |of: &dyn Fn(&WatchedBuffer) -> f64| since.clone().map(of).sum::<f64>() / since.len().max(1) as f64;
-        let seconds = |b: &WatchedBuffer| b.stamps_ns[1].saturating_sub(b.stamps_ns[0]).max(1) as f64 * 1e-9;
+        let length_s = |b: &WatchedBuffer| seconds(b.stamps_ns[1].saturating_sub(b.stamps_ns[0]).max(1));
         let size = match raised.channel {
             Some(c) if c < VELOCITY_DIM => mean(&|b| b.mean[c]),
-            Some(c) => mean(&|b| b.contradiction[c - VELOCITY_DIM] / seconds(b)),
+            Some(c) => mean(&|b| b.contradiction[c - VELOCITY_DIM] / length_s(b)),
             None => 0.0,
         };
         let [weighed, beyond_soil] = [0, 1].map(|i| mean(&|b| b.weighed[i]));

@@ -33,6 +33,14 @@ fn channel(writer: &mut Writer<File>, message: &str, topic: &str) -> u16 {
     writer.add_channel(schema, topic, "cdr").expect("added")
 }
 
+/// A bag with topics of odometry, stamped commands and a gyro.
+fn with_topics(path: &Path) -> (Writer<File>, [u16; 3]) {
+    let mut writer = writer(path);
+    let topics = [("nav_msgs/msg/Odometry", "/odom"), ("geometry_msgs/msg/TwistStamped", "/cmd_vel"), ("sensor_msgs/msg/Imu", "/imu")];
+    let channels = topics.map(|(message, topic)| channel(&mut writer, message, topic));
+    (writer, channels)
+}
+
 fn bag(path: &Path, commands: &[&str]) {
     part(path, commands, 0..40);
 }
@@ -95,11 +103,7 @@ fn analytic_parts_in_a_folder_are_one_bag() {
 fn analytic_messages_count_from_their_stamps_unless_they_are_of_another_clock() {
     let folder = tempfile::tempdir().expect("a folder");
     let path = folder.path().join("run.mcap");
-    let mut writer = writer(&path);
-    let mut channel = |name: &str, topic: &str| channel(&mut writer, name, topic);
-    let odometry = channel("nav_msgs/msg/Odometry", "/odom");
-    let twist = channel("geometry_msgs/msg/TwistStamped", "/cmd_vel");
-    let gyro = channel("sensor_msgs/msg/Imu", "/imu");
+    let (mut writer, [odometry, twist, gyro]) = with_topics(&path);
     let begin = 1_700_000_000_000_000_000_i64;
     for i in 0..40_i64 {
         let at = begin + i * 50_000_000;
@@ -227,11 +231,7 @@ fn analytic_ambiguous_and_missing_topics_are_named() {
 fn with_gyro(odometry_x: impl Fn(i64) -> f64, commanded: impl Fn(i64) -> f64, gyro: impl Fn(i64) -> Option<f64>) -> (Vec<Drive>, Notes) {
     let folder = tempfile::tempdir().expect("a folder");
     let path = folder.path().join("run.mcap");
-    let mut writer = writer(&path);
-    let mut channel = |name: &str, topic: &str| channel(&mut writer, name, topic);
-    let odometry = channel("nav_msgs/msg/Odometry", "/odom");
-    let twist = channel("geometry_msgs/msg/TwistStamped", "/cmd_vel");
-    let imu = channel("sensor_msgs/msg/Imu", "/imu");
+    let (mut writer, [odometry, twist, imu]) = with_topics(&path);
     for i in 0..120_i64 {
         let at = 1_700_000_000_000_000_000 + i * 50_000_000;
         let mut write = |channel, bytes: Vec<u8>| writer.write(channel, 0, at as u64, &bytes).expect("written");

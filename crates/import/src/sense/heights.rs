@@ -3,7 +3,7 @@
 use nesam_physics::Vehicle;
 use nesam_trajectories::Trajectory;
 
-use super::positions::{Jump, Way, back_and_forth, jumps_of};
+use super::positions::{Jump, Way, back_and_forth, in_words, jumps_of};
 use super::relation::{means, surely_most};
 use super::{Doubt, SPEED_M_S, doubt};
 
@@ -18,11 +18,7 @@ pub(super) fn heights(drives: &[Trajectory], vehicle: &Vehicle) -> Option<Doubt>
     let back_and_forth = !jumps.is_empty() && back_and_forth(&jumps);
     // Noise is steep too, and goes neither one way nor with the pitch.
     steep(drives).filter(|steep| steep.with_pitch || !back_and_forth).map(|steep| steep.doubt).or_else(|| {
-        let Jump { drive, way_m, time_s, at_s, fastest_m_s, .. } = jumps.iter().max_by(|a, b| a.way_m.total_cmp(&b.way_m))?;
-        let times = if back_and_forth { format!("back and forth, {} times", jumps.len()) } else { format!("{} times", jumps.len()) };
-        let what = format!(
-            "heights jump {times}: in `{drive}` by {way_m:.1} m within {time_s:.1} s at {at_s:.1} s, where no speed is above {fastest_m_s:.1} m/s"
-        );
+        let what = in_words("heights", &jumps, back_and_forth)?;
         let advice = if back_and_forth {
             "zeros or the like seem to stand for heights that are missing, or they are noise: leave such cells empty, or import without `z` (`--flat`)"
         } else {

@@ -89,12 +89,8 @@ pub(super) struct Jumps {
 pub(super) fn jumps(drives: &[Trajectory], vehicle: &Vehicle) -> Option<Jumps> {
     let found: Vec<Jump> = drives.iter().flat_map(|drive| jumps_of(drive, vehicle, Way::Horizontal)).collect();
     let steps: usize = drives.iter().map(|drive| drive.states.len()).sum();
-    let Jump { drive, way_m, time_s, at_s, fastest_m_s, .. } = found.iter().max_by(|a, b| a.way_m.total_cmp(&b.way_m))?;
     let (count, back_and_forth) = (found.len(), back_and_forth(&found));
-    let times = if back_and_forth { format!("back and forth, {count} times") } else { format!("{count} times") };
-    let what = format!(
-        "positions jump {times}: in `{drive}` by {way_m:.1} m within {time_s:.1} s at {at_s:.1} s, where no speed is above {fastest_m_s:.1} m/s"
-    );
+    let what = in_words("positions", &found, back_and_forth)?;
     let advice = if back_and_forth {
         "two recordings seem to be in one, or zeros or the like to stand for positions that are missing: leave such cells empty"
     } else {
@@ -111,13 +107,23 @@ pub(super) enum Way {
 }
 
 pub(super) struct Jump<'a> {
-    pub(super) drive: &'a str,
-    pub(super) way_m: f64,
-    pub(super) time_s: f64,
-    pub(super) at_s: f64,
-    pub(super) fastest_m_s: f64,
+    drive: &'a str,
+    way_m: f64,
+    time_s: f64,
+    at_s: f64,
+    fastest_m_s: f64,
     /// One of the next two positions lies near the one before.
     comes_back: bool,
+}
+
+/// How often something jumps, and its largest jump; `None` without any.
+pub(super) fn in_words(what: &str, jumps: &[Jump], back_and_forth: bool) -> Option<String> {
+    let Jump { drive, way_m, time_s, at_s, fastest_m_s, .. } = jumps.iter().max_by(|a, b| a.way_m.total_cmp(&b.way_m))?;
+    let to_and_fro = if back_and_forth { "back and forth, " } else { "" };
+    Some(format!(
+        "{what} jump {to_and_fro}{} times: in `{drive}` by {way_m:.1} m within {time_s:.1} s at {at_s:.1} s, where no speed is above {fastest_m_s:.1} m/s",
+        jumps.len()
+    ))
 }
 
 /// Whether positions go to and fro between jumps.

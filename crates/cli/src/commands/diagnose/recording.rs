@@ -3,7 +3,7 @@
 use std::path::PathBuf;
 
 use clap::Args;
-use nesam_engine::Measurement;
+use nesam_engine::{AppliedEffect, Measurement};
 use nesam_evaluation::report::Short;
 use nesam_model::ModelBundle;
 use nesam_model::bundle::sha256_hex;
@@ -93,21 +93,21 @@ impl RecordingArgs {
     /// what the newest says.
     fn newest_with(&self, session: &str, recordings: Vec<Recording>) -> Result<(RecordingHeader, RecordedWindow), Failure> {
         let count = recordings.len();
-        let (mut with_little, mut otherwise) = (None, None);
+        let (mut found, mut otherwise) = (None, None);
         for mut recording in recordings.into_iter().rev() {
             let header = recording.header().clone();
             match window(&mut recording, session, self.from_ns, self.to_ns) {
                 Ok(window) if has_a_piece(&reports(&window)) => {
-                    with_little = Some((header, window));
+                    found = Some((header, window));
                     break;
                 }
-                Ok(window) if !window.measurements.is_empty() => with_little = with_little.or(Some((header, window))),
+                Ok(window) if !window.measurements.is_empty() => found = found.or(Some((header, window))),
                 Ok(window) => otherwise = otherwise.or(Some(Ok((header, window)))),
                 Err(error @ RecordingError::NoSession { .. }) => otherwise = otherwise.or(Some(Err(error))),
                 Err(error) => return Err(error).or_input(),
             }
         }
-        if let Some((header, window)) = with_little {
+        if let Some((header, window)) = found {
             if count > 1 {
                 note!("note: {} is diagnosed, of {count} recordings the newest with enough of this session in the window", header.run);
             }
@@ -118,10 +118,10 @@ impl RecordingArgs {
 }
 
 /// What effects that were applied to a session mean for its diagnosis.
-fn applied_note(session: &str, applied: &[(String, Vec<(String, f64)>)]) -> Option<String> {
-    let one = |(id, parameters): &(String, Vec<(String, f64)>)| {
-        let values: Vec<String> = parameters.iter().map(|(name, value)| format!("{name}={}", Short(*value))).collect();
-        format!("{id}:{}", values.join(","))
+fn applied_note(session: &str, applied: &[AppliedEffect]) -> Option<String> {
+    let one = |effect: &AppliedEffect| {
+        let values: Vec<String> = effect.parameters.iter().map(|p| format!("{}={}", p.name, Short(p.value))).collect();
+        format!("{}:{}", effect.id, values.join(","))
     };
     let effects: Vec<String> = applied.iter().map(one).collect();
     (!effects.is_empty()).then(|| {

@@ -6,7 +6,7 @@ use nesam_discovery::{Against, Diagnosis};
 use nesam_evaluation::POSE_DIM;
 use nesam_evaluation::report::Short;
 
-use crate::output::say;
+use crate::output::{error_heads, say};
 
 /// Hypotheses in the printed table.
 const SHOWN: usize = 12;
@@ -89,9 +89,7 @@ fn findings(found: &Diagnosis) {
             say!("  {} = {} {interval}{}", e.name, Short(e.value), e.unit);
         }
     }
-    for apart in found.findings.iter().filter(|finding| finding.refused.is_none()).filter_map(to_tell_apart) {
-        say!("{apart}");
-    }
+    to_tell_apart(found).for_each(|apart| say!("{apart}"));
     let (z, what) = &found.selection.remaining;
     let place = if what.is_empty() { String::new() } else { format!(" in {what}") };
     say!("{}: z = {z:.1}{place}", if found.selection.chosen.is_empty() { "the most that stands out" } else { "left after that" });
@@ -99,18 +97,7 @@ fn findings(found: &Diagnosis) {
 
 /// Errors on drives that were not fitted, a row for each stage and control.
 fn errors(report: &Report<'_>, found: &Diagnosis) {
-    say!(
-        "\n{:<28}{:>9}{:>9}{:>9}{:>9}{:>9}{:>9}{:>9}{:>9}",
-        "drives not fitted",
-        "x m",
-        "y m",
-        "z m",
-        "roll °",
-        "pitch °",
-        "yaw °",
-        "pos. m",
-        "final m"
-    );
+    say!("\n{:<28}{}{:>9}", "drives not fitted", error_heads(9), "final m");
     let stages = report.stages().into_iter().map(|(name, tree)| (name.to_string(), tree));
     for (name, tree) in stages.chain(report.control_errors()) {
         let numbers: [Option<f64>; POSE_DIM] = tree.mae_mean.to_array();
