@@ -6,7 +6,7 @@ use crate::claims::{Case, Finding};
 use crate::reference::DRIVES_MIN;
 use crate::select::onset::Onset;
 use crate::select::settled::{Settled, onset_in_place};
-use crate::select::{DECISIVE, FURTHER, Selection, Yardstick, without};
+use crate::select::{DECISIVE, FURTHER, RIVALS_MAX, Selection, Yardstick, without};
 
 /// Share of the largest evidence that may be left after the claimed effects, when it is beyond chance (chosen): the model's answer to an effect is not
 /// exact, but most of what is different must be explained before anything is claimed.
@@ -18,6 +18,9 @@ const BEND_LEFT_MAX: f64 = 0.03;
 /// Evidence from which a bend of a sensor speaks against a claimed effect of a sensor (chosen: beside it five bends are asked for and no other column, which by chance reach
 /// that once in seventy-five times).
 const BEND_OF_SENSOR: f64 = 3.0;
+
+/// Most effects that are passed over for their size, one after the other (chosen): a class has at most three members.
+const INSTEAD_MAX: usize = RIVALS_MAX + 1;
 
 /// Outcome for a person in a hurry.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -185,22 +188,34 @@ fn concluded(
 }
 
 /// Where the only effect that is left is refused for its size, its closest rival of another id, if that may be claimed: a payload whose size nobody can tell is seldom
-/// one. A model on trial takes one effect after the other and tries each for itself.
+/// one. A rival that is refused for its size too gives way to the next one. A model on trial takes one effect after the other and tries each for itself.
 fn rival_instead(case: &Case<'_>, yardstick: &Yardstick, judgement: Judgement) -> Judgement {
-    let Some(first) = judgement.findings.first().filter(|f| f.refused_for_size && !yardstick.model_on_trial) else { return judgement };
-    let Some(rival) = closest_of_another_id(&judgement.selection, &yardstick.catalogue) else { return judgement };
-    let (mut selection, mut onsets) = (judgement.selection.clone(), judgement.onsets.clone());
-    onsets[rival] = onset_in_place(&onsets, rival, first.hypothesis);
-    selection.choose(yardstick, &yardstick.group(case.condensed()), vec![rival]);
-    let instead = concluded(case, yardstick, selection, onsets, &[first.hypothesis], judgement.findings.clone());
-    if instead.claimed().is_empty() { judgement } else { instead }
+    let mut passed_over = Vec::new();
+    let mut last = None;
+    while passed_over.len() < INSTEAD_MAX {
+        let refused = last.as_ref().unwrap_or(&judgement);
+        let Some(first) = refused.findings.first().filter(|f| f.refused_for_size && !yardstick.model_on_trial) else { break };
+        passed_over.push(first.hypothesis);
+        let Some(rival) = closest_of_another_id(&refused.selection, &yardstick.catalogue, &passed_over) else { break };
+        let (mut selection, mut onsets) = (refused.selection.clone(), refused.onsets.clone());
+        onsets[rival] = onset_in_place(&onsets, rival, first.hypothesis);
+        selection.choose(yardstick, &yardstick.group(case.condensed()), vec![rival]);
+        let instead = concluded(case, yardstick, selection, onsets, &passed_over, refused.findings.clone());
+        if !instead.claimed().is_empty() {
+            return instead;
+        }
+        last = Some(instead);
+    }
+    judgement
 }
 
-/// The closest rival of the only chosen hypothesis that has another id and is not decided against.
-fn closest_of_another_id(selection: &Selection, catalogue: &[Candidate]) -> Option<usize> {
-    let [only] = selection.chosen[..] else { return None };
+/// The closest rival of the only chosen hypothesis that has an id of which nothing is `passed_over` and is not decided against.
+fn closest_of_another_id(selection: &Selection, catalogue: &[Candidate], passed_over: &[usize]) -> Option<usize> {
+    if selection.chosen.len() != 1 {
+        return None;
+    }
     let close = selection.rivals[0].iter().filter(|r| r.difference < DECISIVE);
-    close.map(|r| r.hypothesis).find(|h| catalogue[*h].id() != catalogue[only].id())
+    close.map(|r| r.hypothesis).find(|h| passed_over.iter().all(|p| catalogue[*h].id() != catalogue[*p].id()))
 }
 
 /// That drives differ from a model on trial.
@@ -302,12 +317,12 @@ mod tests {
     use crate::select::Rival;
 
     /// Goal: what stands in for an effect that is refused for its size is close to it and something else. Method: a drag of one wheel with rivals: other wheels, then a
-    /// tow that is close or decided against.
+    /// tow that is close or decided against, or was refused before.
     #[test]
     fn analytic_the_closest_rival_of_another_id_stands_in() {
         let catalogue = catalogue(&[]);
         let at = |label: &str| catalogue.iter().position(|c| c.label() == label).unwrap();
-        let stands_in = |chosen: &[&str], rivals: &[(&str, f64)]| {
+        let beside = |chosen: &[&str], rivals: &[(&str, f64)], refused: &[&str]| {
             let rivals: Vec<Rival> =
                 rivals.iter().map(|(label, difference)| Rival { hypothesis: at(label), difference: *difference }).collect();
             let selection = Selection {
@@ -315,12 +330,14 @@ mod tests {
                 rivals: vec![rivals; chosen.len()],
                 ..Selection::empty(4.0)
             };
-            closest_of_another_id(&selection, &catalogue)
+            closest_of_another_id(&selection, &catalogue, &refused.iter().map(|label| at(label)).collect::<Vec<_>>())
         };
+        let stands_in = |chosen: &[&str], rivals: &[(&str, f64)]| beside(chosen, rivals, &chosen[..1]);
         let close = [("wheel_drag RR", 0.5), ("tow", 5.9), ("linear_drag", 5.95)];
         assert_eq!(stands_in(&["wheel_drag FR"], &close), Some(at("tow")));
         assert_eq!(stands_in(&["wheel_drag FR"], &[("wheel_drag RR", 0.5), ("tow", 6.1)]), None);
         assert_eq!(stands_in(&["wheel_drag FR", "gyro_bias"], &close), None, "the other one can be claimed");
+        assert_eq!(beside(&["wheel_drag FR"], &close, &["tow", "wheel_drag FR"]), Some(at("linear_drag")));
     }
 
     /// A selection of this largest evidence, of which these are left: of anything, and of levels.
