@@ -113,14 +113,14 @@ impl PlantVehicle {
         })
     }
 
-    /// Road-wheel angles of the front wheels (left, right) for an actuator position: linear in the table, held at its ends, rad.
+    /// Road-wheel angles of the front wheels (left, right) for an actuator position: linear in the table and on with the slope at its ends, rad.
     pub(crate) fn road_wheel_angles(&self, position: f64) -> [f64; 2] {
         let table = &self.steering;
         let (Some(first), Some(last)) = (table.first(), table.last()) else { return [0.0; 2] };
-        let at = position.clamp(first[0], last[0]);
-        let above = table.iter().position(|row| row[0] >= at).unwrap_or(table.len() - 1).max(1);
+        let within = position.clamp(first[0], last[0]);
+        let above = table.iter().position(|row| row[0] >= within).unwrap_or(table.len() - 1).max(1);
         let (low, high) = (table[above - 1], table[above]);
-        let share = (at - low[0]) / (high[0] - low[0]);
+        let share = (position - low[0]) / (high[0] - low[0]);
         [low[1] + share * (high[1] - low[1]), low[2] + share * (high[2] - low[2])]
     }
 }

@@ -98,7 +98,7 @@ impl DriveLine {
     }
 
     fn steer(&mut self, vehicle: &PlantVehicle, effects: &HiddenEffects, time_s: f64, dt_s: f64) {
-        let wanted = (self.heard(time_s, effects.steering_delay_s).steering + effects.steering_offset).clamp(-1.0, 1.0);
+        let wanted = self.heard(time_s, effects.steering_delay_s).steering.clamp(-1.0, 1.0);
         let rate = (wanted - self.steering) / (vehicle.steering_lag_s + effects.steering_lag_s);
         self.steering += rate.clamp(-vehicle.steering_rate_per_s, vehicle.steering_rate_per_s) * dt_s;
     }

@@ -13,7 +13,7 @@ pub struct HiddenEffects {
     pub wheel_drag_n_m: f64,
     /// Which wheel: 0 FL, 1 FR, 2 RL, 3 RR.
     pub wheel_drag_wheel: usize,
-    /// Added to the steering command at the actuator, normalised.
+    /// Added to the position of the steering in the linkage, behind its stops, normalised, as in the Chrono car of the open set `steer_offset`.
     pub steering_offset: f64,
     /// Relative change of the road-wheel angles.
     pub steering_ratio: f64,

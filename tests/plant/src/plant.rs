@@ -255,7 +255,8 @@ impl Plant {
     }
 
     fn road_wheel_angles(&self) -> [f64; 2] {
-        self.vehicle.road_wheel_angles(self.drive_line.steering).map(|angle| angle * (1.0 + self.effects.steering_ratio))
+        let position = self.drive_line.steering + self.effects.steering_offset;
+        self.vehicle.road_wheel_angles(position).map(|angle| angle * (1.0 + self.effects.steering_ratio))
     }
 
     fn velocity_of_reference(&self) -> Vec3 {
