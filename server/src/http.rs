@@ -17,7 +17,7 @@ use crate::grpc::Edge;
 use crate::recording::Recorder;
 use crate::store::StoreCounts;
 use crate::web::Live;
-use crate::zenoh::Neighbours;
+use crate::zenoh::{Neighbours, Presence};
 
 /// What the HTTP side reads.
 #[derive(Clone)]
@@ -74,9 +74,8 @@ async fn metrics(State(state): State<HttpState>) -> Response {
     // A server that is alone owns whatever it has.
     let alone = ClusterCounts { leased: true, held: sessions, ..Default::default() };
     text += &cluster_metrics(&state.edge.cluster.as_ref().map_or(alone, Cluster::counts));
-    if let Some(presence) = &state.edge.presence {
-        text += &metric("nesam_vehicles_alive", "gauge", "Vehicles whose Zenoh liveliness token is there.", presence.count());
-    }
+    let alive = state.edge.presence.as_ref().map_or(0, Presence::count);
+    text += &metric("nesam_vehicles_alive", "gauge", "Vehicles whose Zenoh liveliness token is there.", alive);
     text += &neighbour_metrics(&state.edge.presence.map_or_else(Neighbours::default, |presence| presence.neighbours));
     ([("content-type", "text/plain; version=0.0.4; charset=utf-8")], text).into_response()
 }
@@ -117,13 +116,20 @@ fn metric(name: &str, kind: &str, help: &str, value: impl core::fmt::Display) ->
 }
 
 fn cluster_metrics(counts: &ClusterCounts) -> String {
-    let ClusterCounts { held, taken, handed_over, lost, leased } = *counts;
+    let ClusterCounts { held, taken, handed_over, lost, leased, others, other_bundles } = *counts;
     [
         ("sessions", "gauge", "Sessions whose owner this server is.", held as u64),
         ("taken_total", "counter", "Sessions that came from another server.", taken),
         ("handed_over_total", "counter", "Sessions that another server asked for.", handed_over),
         ("lost_total", "counter", "Sessions lost with the lease or to another server.", lost),
         ("leased", "gauge", "Whether this server may answer for its sessions: 1 while etcd hears it.", u64::from(leased)),
+        ("servers", "gauge", "Servers that share sessions, this one among them.", others as u64 + 1),
+        (
+            "other_bundles",
+            "gauge",
+            "Servers that share sessions and answer with another bundle, to and from which no session can move.",
+            other_bundles as u64,
+        ),
     ]
     .map(|(name, kind, help, value)| metric(&format!("nesam_cluster_{name}"), kind, help, value))
     .concat()

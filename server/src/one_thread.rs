@@ -65,8 +65,8 @@ where
             None
         }
         Sessions::Shared(channel) => {
-            let address = config.grpc.listen.to_string();
-            let cluster = Cluster::start(Etcd::over(channel), &config.cluster, address, engine.clone(), keeper.clone()).await?;
+            let (address, bundle) = (config.grpc.listen.to_string(), predictor.bundle());
+            let cluster = Cluster::start(Etcd::over(channel), &config.cluster, (address, bundle), engine.clone(), keeper.clone()).await?;
             let store = EtcdStore::new(cluster.clone(), tokio::runtime::Handle::current());
             tokio::spawn(keeper.clone().keep(Box::new(store), handle, Restored::default()));
             Some(cluster)

@@ -8,7 +8,7 @@ use std::task::Poll;
 use std::time::Duration;
 
 use nesam_engine::{Clock as _, Engine, EngineHandle, Event, EventSink, Tap};
-use nesam_model::Predictor;
+use nesam_model::{ModelBundle, Predictor};
 use nesam_proto::v1 as pb;
 use tokio::net::{TcpListener, TcpSocket};
 use tokio::sync::{broadcast, watch};
@@ -111,7 +111,7 @@ pub async fn serve(config: Config, predictor: Arc<Predictor>) -> Result<RunningS
     let reload_every = Duration::from_secs_f64(config.tls.reload_s);
     let store_interval = Duration::from_secs_f64(config.store.interval_s);
     let (cluster, cluster_files) = match &keeper {
-        Some(keeper) => match open_store(&config, grpc_addr, keeper, &engine).await {
+        Some(keeper) => match open_store(&config, (grpc_addr, predictor.bundle()), keeper, &engine).await {
             Ok(opened) => opened,
             Err(error) => {
                 handle.stop();
@@ -251,7 +251,7 @@ pub(crate) fn event_sink(
 /// and what reads its certificates again.
 async fn open_store(
     config: &Config,
-    grpc_addr: SocketAddr,
+    (grpc_addr, bundle): (SocketAddr, &ModelBundle),
     keeper: &Arc<Keeper>,
     engine: &EngineClient,
 ) -> Result<(Option<Cluster>, Option<ClusterFiles>), ServerError> {
@@ -260,7 +260,7 @@ async fn open_store(
         return opened.map(|()| (None, None)).map_err(|source| ServerError::Store { source });
     }
     let (etcd, files) = Etcd::new(&config.cluster)?;
-    let cluster = Cluster::start(etcd, &config.cluster, grpc_addr.to_string(), engine.clone(), keeper.clone()).await?;
+    let cluster = Cluster::start(etcd, &config.cluster, (grpc_addr.to_string(), bundle), engine.clone(), keeper.clone()).await?;
     let store = EtcdStore::new(cluster.clone(), tokio::runtime::Handle::current());
     if let Err(source) = keeper.start(Box::new(store), engine.handle().clone(), Restored::default()) {
         cluster.stop().await;

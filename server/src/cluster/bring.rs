@@ -82,7 +82,7 @@ impl Asked {
         let lease = cluster.0.lease.id().ok_or_else(|| moved(session))?;
         let (cluster, session, runtime) = (cluster.clone(), session.to_owned(), Handle::current());
         let telling = tokio::spawn(async move {
-            let told = cluster.0.etcd.all(vec![put(&cluster.0.keys.want(&session), json(&cluster.0.me), lease)]).await?;
+            let told = cluster.0.etcd.all(vec![put(&cluster.0.keys.want(&session), json(&cluster.0.me.server), lease)]).await?;
             Ok(Self { cluster, session, epoch, revision: Some(told.revision), runtime })
         });
         telling.await.map_err(|error| Status::internal(format!("asking for a session: {error}")))?
@@ -269,7 +269,7 @@ impl Cluster {
         let Some(lease) = self.0.lease.id() else { return Err(moved(session)) };
         let owner = keys.owner(session);
         // Read in the same transaction: nobody writes after it without the new epoch.
-        let then = vec![put(&owner, json(&self.0.me), lease), delete(&keys.want(session)), get(&keys.session(session))];
+        let then = vec![put(&owner, json(&self.0.me.server), lease), delete(&keys.want(session)), get(&keys.session(session))];
         let done = self.0.etcd.transaction(vec![created(&owner, 0)], then).await?;
         if !done.held {
             return Ok(false);

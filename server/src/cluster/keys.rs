@@ -1,9 +1,10 @@
 //! Keys of a fleet in etcd, all below one prefix:
 //!
 //! ```text
-//! <prefix>/live/owner/<session>     who has the session: an Owner, under the owner's lease; its create revision is the epoch
+//! <prefix>/live/owner/<session>     who has the session: a Server, under the owner's lease; its create revision is the epoch
 //! <prefix>/live/want/<session>      who asks the owner for it, under the asker's lease
 //! <prefix>/live/map/<map>           hash, number of parts and version of the newest map
+//! <prefix>/live/member/<lease>      a server that is there: a Member, under its lease
 //! <prefix>/session/<session>        the session's image
 //! <prefix>/part/<map>/<hash>/<n>    bytes of a map, in order
 //! ```
@@ -22,6 +23,7 @@ pub(crate) enum Topic<'a> {
     Owner(&'a str),
     Want(&'a str),
     Map(&'a str),
+    Member(i64),
 }
 
 impl Keys {
@@ -43,6 +45,10 @@ impl Keys {
 
     pub fn map(&self, map: &str) -> String {
         format!("{}/live/map/{map}", self.prefix)
+    }
+
+    pub fn member(&self, lease: i64) -> String {
+        format!("{}/live/member/{lease:x}", self.prefix)
     }
 
     /// Before the images of all sessions.
@@ -76,6 +82,7 @@ impl Keys {
             ("owner", session) => Some(Topic::Owner(session)),
             ("want", session) => Some(Topic::Want(session)),
             ("map", map) => Some(Topic::Map(map)),
+            ("member", lease) => i64::from_str_radix(lease, 16).ok().map(Topic::Member),
             _ => None,
         }
     }
@@ -101,6 +108,7 @@ mod tests {
         assert_eq!(keys.topic(keys.owner("t-7").as_bytes()), Some(Topic::Owner("t-7")));
         assert_eq!(keys.topic(keys.want("t-7").as_bytes()), Some(Topic::Want("t-7")));
         assert_eq!(keys.topic(keys.map("hill").as_bytes()), Some(Topic::Map("hill")));
+        assert_eq!(keys.topic(keys.member(255).as_bytes()), Some(Topic::Member(255)));
         for other in [keys.session("t-7"), keys.part("hill", "ab", 3), "a/bc/live/owner/x".into(), String::new()] {
             assert_eq!(keys.topic(other.as_bytes()), None, "{other}");
         }

@@ -19,6 +19,7 @@ mod keys;
 mod lease;
 mod leave;
 mod maps;
+mod members;
 mod reap;
 mod record;
 mod watch;
@@ -27,6 +28,7 @@ use std::collections::BTreeMap;
 use std::sync::{Arc, Mutex, MutexGuard};
 use std::time::Duration;
 
+use nesam_model::ModelBundle;
 use tokio::sync::{broadcast, watch as latest};
 use tokio::task::JoinHandle;
 use tokio::time::Instant;
@@ -40,9 +42,10 @@ pub(crate) use self::files::ClusterFiles;
 pub use self::files::etcd_endpoint;
 pub(crate) use self::keys::Keys;
 use self::lease::Lease;
-use self::record::Server;
+use self::members::Members;
 pub use self::record::knows_record;
 pub(crate) use self::record::session_bytes;
+use self::record::{Member, Server};
 use crate::call::EngineClient;
 use crate::config::ClusterConfig;
 use crate::error::ServerError;
@@ -91,6 +94,9 @@ pub(crate) struct ClusterCounts {
     pub lost: u64,
     /// Whether the lease lasts.
     pub leased: bool,
+    /// Servers beside this one, and how many of them answer with another bundle.
+    pub others: usize,
+    pub other_bundles: usize,
 }
 
 #[derive(Debug, Default)]
@@ -108,6 +114,7 @@ struct State {
     looked: BTreeMap<String, Instant>,
     /// SHA-256 of each map that is in etcd, as it was last read or written.
     maps: BTreeMap<String, String>,
+    members: Members,
     counts: ClusterCounts,
 }
 
@@ -154,7 +161,7 @@ pub(crate) struct Cluster(Arc<Inner>);
 struct Inner {
     etcd: Etcd,
     keys: Keys,
-    me: Server,
+    me: Member,
     lease: Lease,
     state: Mutex<State>,
     /// Counts the changes of owners, for those who wait for one.
@@ -167,14 +174,14 @@ struct Inner {
 }
 
 impl Cluster {
-    /// Joins the servers at this etcd, and returns when the first lease is there.
+    /// Joins the servers at this etcd as the one at `address` with this bundle, and returns when the first lease is there.
     ///
     /// # Errors
     /// `ServerError` when etcd does not answer.
     pub async fn start(
         etcd: Etcd,
         config: &ClusterConfig,
-        address: String,
+        (address, bundle): (String, &ModelBundle),
         engine: EngineClient,
         keeper: Arc<Keeper>,
     ) -> Result<Self, ServerError> {
@@ -184,7 +191,7 @@ impl Cluster {
         let cluster = Self(Arc::new(Inner {
             etcd: etcd.clone(),
             keys: Keys::new(&config.prefix),
-            me: Server { name, address },
+            me: Member { server: Server { name, address }, bundle: bundle.name.clone(), bundle_hash: bundle.hash.clone() },
             lease: Lease::new(f64::from(config.lease_s)),
             state: Mutex::default(),
             changes,
@@ -200,7 +207,7 @@ impl Cluster {
         let keeping = tokio::spawn(cluster.0.lease.clone().keep(etcd, lost));
         let watching = tokio::spawn(cluster.clone().watch());
         if let Ok(mut tasks) = cluster.0.tasks.lock() {
-            tasks.extend([keeping, watching, tokio::spawn(cluster.clone().compact())]);
+            tasks.extend([keeping, watching, tokio::spawn(cluster.clone().compact()), tokio::spawn(cluster.clone().announce())]);
             // A time that no clock can hold is never.
             if let Ok(idle) = Duration::try_from_secs_f64(cluster.0.engine.handle().limits().session_idle_s) {
                 tasks.push(tokio::spawn(cluster.clone().reap(idle)));
@@ -218,7 +225,7 @@ impl Cluster {
             }
             tokio::time::sleep(Duration::from_millis(10)).await;
         }
-        tracing::info!(server = cluster.0.me.name, etcd = config.etcd.join(","), lease_s = config.lease_s, "sharing sessions");
+        tracing::info!(server = cluster.0.me.server.name, etcd = config.etcd.join(","), lease_s = config.lease_s, "sharing sessions");
         Ok(cluster)
     }
 
@@ -284,7 +291,8 @@ impl Cluster {
     /// Counters.
     pub fn counts(&self) -> ClusterCounts {
         let state = self.lock();
-        ClusterCounts { held: state.held.len(), leased: self.is_leased(), ..state.counts }
+        let [others, other_bundles] = state.members.others(&self.0.me);
+        ClusterCounts { held: state.held.len(), leased: self.is_leased(), others, other_bundles, ..state.counts }
     }
 }
 

@@ -15,6 +15,18 @@ pub(super) struct Server {
     pub address: String,
 }
 
+/// A server that is there.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub(super) struct Member {
+    /// Its name and address.
+    #[serde(flatten)]
+    pub server: Server,
+    /// Name of the bundle that it answers with.
+    pub bundle: String,
+    /// SHA-256 of that bundle, hexadecimal.
+    pub bundle_hash: String,
+}
+
 /// The newest content of a map.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub(super) struct MapHead {
@@ -55,6 +67,7 @@ pub fn knows_record(prefix: &str, key: &[u8], value: &[u8]) -> bool {
     match keys.topic(key) {
         Some(Topic::Owner(_) | Topic::Want(_)) => of_json::<Server>(value).is_some(),
         Some(Topic::Map(_)) => of_json::<MapHead>(value).is_some(),
+        Some(Topic::Member(_)) => of_json::<Member>(value).is_some(),
         None => {
             let session = keys.session_name(key).and_then(|name| session_of(name, value));
             session.is_some_and(|stored| session_image(&stored.image).is_ok())

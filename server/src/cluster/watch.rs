@@ -6,7 +6,7 @@ use nesam_proto::etcd as pb;
 use tonic::Status;
 
 use super::keys::Topic;
-use super::record::{MapHead, Server, of_json};
+use super::record::{MapHead, of_json};
 use super::{Cluster, Owner, get_all};
 
 /// Time for which etcd remembers old contents, at least.
@@ -47,6 +47,8 @@ impl Cluster {
             let mut state = self.lock();
             state.owners.clear();
             state.wants.clear();
+            let is_there = |lease| all.read.iter().flatten().any(|found| self.0.keys.topic(&found.key) == Some(Topic::Member(lease)));
+            state.members.keep(is_there);
             let there = |map: &str| all.read.iter().flatten().any(|found| self.0.keys.topic(&found.key) == Some(Topic::Map(map)));
             state.maps.keys().filter(|map| !there(map)).cloned().collect()
         };
@@ -91,8 +93,8 @@ impl Cluster {
                 self.lock().owners.remove(session);
             }
             (Some(Topic::Want(session)), true) => {
-                let by_other = of_json::<Server>(&found.value).is_some_and(|asker| asker != self.0.me);
-                if by_other {
+                // By the lease: two servers may have been given the same name.
+                if self.0.lease.number() != Some(found.lease) {
                     self.lock().wants.insert(session.into(), found.mod_revision);
                     self.heed(session);
                 } else {
@@ -110,6 +112,12 @@ impl Cluster {
             (Some(Topic::Map(map)), false) => {
                 tokio::spawn(self.clone().lose_map(map.into()));
             }
+            (Some(Topic::Member(lease)), true) => {
+                if let Some(member) = of_json(&found.value) {
+                    self.lock().members.note(lease, member);
+                }
+            }
+            (Some(Topic::Member(lease)), false) => self.lock().members.forget(lease),
             (None, _) => {}
         }
     }

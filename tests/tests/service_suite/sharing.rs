@@ -10,6 +10,7 @@ use nesam_server::RunningServer;
 use tokio_stream::wrappers::TcpListenerStream;
 use tonic::Code;
 
+use crate::lifecycle::http_get;
 use crate::simulation::etcd::{Etcd, Trouble};
 use crate::stage::*;
 
@@ -195,6 +196,27 @@ async fn service_a_key_without_a_session_is_given_back_to_whoever_asks() {
     open(&mut two.client, "s", "").await;
     assert_ne!(etcd.get("nesam/live/owner/s").unwrap().lease, owner.lease);
     one.client.session("other").await.unwrap();
+    shut_down([one, two]).await;
+}
+
+/// Goal: servers know of each other, and which of them has another bundle. Method: a key in etcd as such a server writes it, and without it.
+#[tokio::test(flavor = "multi_thread")]
+async fn service_a_server_with_another_bundle_is_told_of() {
+    let (etcd, mut one, two) = two_servers().await;
+    open(&mut one.client, "s", "").await;
+    let lease = etcd.get("nesam/live/owner/s").unwrap().lease;
+    let http = one.server.http_addr.unwrap();
+    let counted = async |servers: usize, other_bundles: usize| {
+        let (_, metrics) = http_get(http, "/metrics").await;
+        let lines = [format!("nesam_cluster_servers {servers}"), format!("nesam_cluster_other_bundles {other_bundles}")];
+        lines.iter().all(|line| metrics.lines().any(|own| own == line))
+    };
+    eventually(PATIENCE, "two servers", async || counted(2, 0).await).await;
+    let other = r#"{"name":"two","address":"host:1","bundle":"other","bundle_hash":"ab"}"#;
+    etcd.put("nesam/live/member/7", other.into(), lease);
+    eventually(PATIENCE, "a third one with another bundle", async || counted(3, 1).await).await;
+    etcd.delete_all("nesam/live/member/");
+    eventually(PATIENCE, "the others are gone", async || counted(1, 0).await).await;
     shut_down([one, two]).await;
 }
 
