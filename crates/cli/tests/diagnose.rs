@@ -7,7 +7,7 @@ mod common;
 use std::path::Path;
 use std::sync::Arc;
 
-use common::{bundle, nesam, repository, sample};
+use common::{bundle, nesam, repository, sample, stderr};
 use nesam_plant::{Command as Told, DriveRecorder, Ground, HiddenEffects, Plant, PlantVehicle, Sensors, write_set};
 use serde_json::Value;
 
@@ -136,4 +136,51 @@ fn service_drives_in_which_nothing_moves_are_told_as_such() {
         );
     }
     assert!(!here.path().join("nesam-out/diagnose-held/diagnose.json").exists());
+}
+
+/// Goal: on drives of an external simulator the shipped bundle names the steering offset they have, sizes it, writes a bundle that has it, and
+/// finds nothing in drives without an effect. Method: the command on two drives of each; the truth is 0.12.
+#[test]
+fn chrono_diagnose_names_a_steering_offset_and_nothing_without_one() {
+    let here = tempfile::tempdir().unwrap();
+    let root = sample().display().to_string();
+    let shipped = bundle("hmmwv-nominal");
+    let run = |set: &str, out: &str| -> Value {
+        let output = nesam(&["diagnose", "--data", &root, "--set", set, "--bundle", &shipped, "--out", out], here.path());
+        assert_eq!(output.status.code(), Some(0), "{}", stderr(&output));
+        serde_json::from_slice(&std::fs::read(here.path().join(out).join("diagnose.json")).unwrap()).unwrap()
+    };
+    let found = run("effect_open/steer_offset", "steer");
+    assert_eq!((found["schema"].as_str(), found["verdict"].as_str()), (Some("nesam.diagnose/1"), Some("explained")), "{}", found["reason"]);
+    let effect = &found["effects"][0];
+    assert_eq!(effect["id"], "steering_offset");
+    let second = &effect["parameters"][0];
+    assert!((second["value"].as_f64().unwrap() - 0.12).abs() < 0.012, "{second}");
+    assert_eq!(second["ci95"].as_array().unwrap().len(), 2);
+    let rivals: f64 = effect["rivals"].as_array().unwrap().iter().map(|r| r["weight"].as_f64().unwrap()).sum();
+    assert!((effect["weight"].as_f64().unwrap() + rivals - 1.0).abs() < 1e-9);
+    let position = |stage: &str| found[stage]["position_m"]["mean"].as_f64().unwrap();
+    assert!(position("after") < 0.8 * position("before") && position("after") < 0.8 * position("soil_only"));
+    let patched = ["predict", "--data", &root, "--set", "nominal", "--bundle", "steer/bundle", "--horizon", "5", "--out", "p.json"];
+    let predicted = nesam(&patched, here.path());
+    assert_eq!(predicted.status.code(), Some(0), "{}", stderr(&predicted));
+
+    let nothing = run("effect_open/null_open", "null");
+    assert_eq!(nothing["verdict"], "none", "{}", nothing["reason"]);
+    assert!(nothing["effects"].as_array().unwrap().is_empty() && nothing["bundle"].is_null());
+}
+
+/// A bias of the gyro in three drives of the plant: found, sized, and written down with what was hidden.
+#[test]
+fn service_bench_plant_scores_what_a_diagnosis_makes_of_a_hidden_effect() {
+    let folder = tempfile::tempdir().unwrap();
+    common::refused(&["bench", "plant", "--worlds", "w01", "--effects", "ghosts"], folder.path(), &["ghosts", "gyro_bias"]);
+    let hidden = ["--effects", "gyro_bias", "--doses", "1", "--drives", "3", "--nulls", "0", "--json", "plant.json"];
+    let output = nesam(&[&["bench", "plant", "--worlds", "w01,w05,w16"][..], &hidden].concat(), folder.path());
+    assert!(output.status.success(), "{}", stderr(&output));
+    let read: Value = serde_json::from_slice(&std::fs::read(folder.path().join("plant.json")).unwrap()).unwrap();
+    let run = &read["runs"][0];
+    let (size, estimate) = (run["size"].as_f64().unwrap(), run["estimate"].as_f64().unwrap());
+    assert_eq!(run["named"][0][0], "gyro_bias", "{run}");
+    assert!((estimate / size - 1.0).abs() < 0.15, "{estimate} of {size}");
 }

@@ -1,4 +1,5 @@
-//! Goal: laps on simulators of others, as a person drives them. Method: the real binary on a bicycle behind the plant protocol, which ends its laps early.
+//! Goal: laps, on the built-in plant and on simulators of others, as a person drives them. Method: the real binary with small plans, also on a bicycle behind the plant
+//! protocol, which ends its laps early.
 #![allow(clippy::unwrap_used)]
 
 #[path = "../../navigation/tests/common/bicycle.rs"]
@@ -9,7 +10,7 @@ use std::path::Path;
 use std::process::{Command, Output};
 
 use bicycle::{Habits, RIGHT, bicycle, bicycle_with};
-use common::{bundle, sample, stderr};
+use common::{bundle, copy_folder, nesam, refused, repository, sample, stderr};
 use serde_json::Value;
 
 /// Drives laps with small plans; `more` has a plant.
@@ -209,4 +210,67 @@ fn regress_why_laps_were_not_completed_is_said() {
     );
     let (_, notes) = said(&bicycle_with(Habits { left: -1.0, ..RIGHT }, |_, _, reply| vec![reply.to_string()]));
     assert!(notes.contains("turns right where it is told to turn left"), "{notes}");
+}
+
+/// The bundle itself in the place of one with effects: the same laps, so what differs in other laps is the effects.
+#[test]
+fn service_laps_with_a_diagnosed_bundle_differ_by_its_effects_alone() {
+    let folder = tempfile::tempdir().unwrap();
+    let (root, bundle) = (sample().display().to_string(), bundle("hmmwv-nominal"));
+    let quick = ["--worlds", "w01", "--runs", "1", "--candidates", "4", "--horizon", "10", "--plan-every", "10", "--out", "laps"];
+    let asked = |more: &[&'static str]| [&["navigate", "--data", &root, "--bundle", &bundle][..], &quick, more].concat();
+    refused(&asked(&["--configurations", "diagnosed"]), folder.path(), &["--diagnosed"]);
+    let with: Vec<&str> = [asked(&["--configurations", "adapted,diagnosed", "--json", "laps.json"]), vec!["--diagnosed", &bundle]].concat();
+    let output = nesam(&with, folder.path());
+    assert!(output.status.success(), "{}", stderr(&output));
+    let laps: Value = serde_json::from_slice(&std::fs::read(folder.path().join("laps.json")).unwrap()).unwrap();
+    let of = |i: usize| (laps["each"][i]["configuration"].as_str().unwrap().to_string(), laps["each"][i]["lap"].clone());
+    let ((first, adapted), (second, diagnosed)) = (of(0), of(1));
+    assert_eq!((first.as_str(), second.as_str()), ("adapted", "diagnosed"));
+    assert!(adapted["measurements"]["APPLIED"].as_u64() > Some(50) && adapted == diagnosed, "{adapted} {diagnosed}");
+}
+
+/// A copy of one world of the sample with a vehicle card.
+fn root_of_a_world(card: &Path, name: &str) -> tempfile::TempDir {
+    let root = tempfile::tempdir().unwrap();
+    copy_folder(&sample().join("worlds/w01"), &root.path().join("worlds/w01"));
+    std::fs::copy(card, root.path().join(name)).unwrap();
+    root
+}
+
+/// Goal: laps are taken from an earlier run only where card and true soil are what they were. Method: both files, one after the other, with one byte more.
+#[test]
+fn service_laps_are_driven_again_where_card_or_soil_changed() {
+    let root = root_of_a_world(&sample().join("vehicle_hmmwv.json"), "vehicle_hmmwv.json");
+    let bundle = bundle("hmmwv-nominal");
+    let drive = || {
+        let quick = ["--runs", "1", "--candidates", "4", "--horizon", "10", "--plan-every", "10", "--out", "laps"];
+        let asked = ["navigate", "--data", ".", "--bundle", &bundle, "--worlds", "w01", "--configurations", "kinematic"];
+        let output = nesam(&[&asked[..], &quick].concat(), root.path());
+        assert!(output.status.success(), "{}", stderr(&output));
+        stderr(&output).contains("driven with other settings")
+    };
+    assert!(!drive() && !drive(), "the same laps");
+    for file in ["worlds/w01/gt_soil.json", "vehicle_hmmwv.json"] {
+        let text = std::fs::read_to_string(root.path().join(file)).unwrap();
+        std::fs::write(root.path().join(file), text + "\n").unwrap();
+        assert!(drive(), "{file}");
+    }
+}
+
+/// Goal: nobody drives laps of one vehicle with the model of another without being told. Method: the car's bundle on the card of a skid-steer robot, which the
+/// built-in plant is not.
+#[test]
+fn service_laps_of_another_vehicle_than_that_of_the_bundle_are_told() {
+    let root = root_of_a_world(&repository().join("deploy/bundles/clearpath-husky/vehicle.json"), "vehicle_husky.json");
+    let bundle = bundle("hmmwv-nominal");
+    let asked =
+        |more: &[&'static str]| [&["navigate", "--data", ".", "--bundle", &bundle, "--worlds", "w01", "--runs", "1"][..], more].concat();
+    let moved = "was trained for `HMMWV";
+    refused(&asked(&["--speed", "3.5"]), root.path(), &[moved, "--speed 3.5 is not 0.5 to 3 m/s"]);
+    let words = [moved, "no kinematic model fitted for `Clearpath Husky"];
+    refused(&asked(&["--configurations", "kinematic"]), root.path(), &words);
+    let advice = ["no kinematic model", "use --configurations fixed,adapted"];
+    refused(&asked(&["--configurations", "fixed,kinematic,adapted"]), root.path(), &advice);
+    refused(&asked(&[]), root.path(), &[moved, "kinematic is left out", "vehicle_husky.json"]);
 }

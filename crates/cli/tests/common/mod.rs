@@ -4,6 +4,7 @@
 use std::io::{BufRead, BufReader};
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command, Output, Stdio};
+use std::sync::OnceLock;
 
 pub const BINARY: &str = env!("CARGO_BIN_EXE_nesam");
 
@@ -19,6 +20,34 @@ pub fn sample() -> PathBuf {
 /// A shipped bundle.
 pub fn bundle(name: &str) -> String {
     repository().join("deploy/bundles").join(name).display().to_string()
+}
+
+/// Copies a folder with all that is in it.
+pub fn copy_folder(from: &Path, to: &Path) {
+    std::fs::create_dir_all(to).unwrap();
+    for entry in std::fs::read_dir(from).unwrap().flatten() {
+        let target = to.join(entry.file_name());
+        if entry.path().is_dir() {
+            copy_folder(&entry.path(), &target);
+        } else {
+            std::fs::copy(entry.path(), target).unwrap();
+        }
+    }
+}
+
+/// A bundle of two training steps: its errors mean nothing, everything else is real.
+pub fn tiny_bundle() -> &'static Path {
+    static BUNDLE: OnceLock<(tempfile::TempDir, PathBuf)> = OnceLock::new();
+    let (_, bundle) = BUNDLE.get_or_init(|| {
+        let dir = tempfile::tempdir().unwrap();
+        let root = sample().display().to_string();
+        let tiny = ["--epochs", "1", "--batches", "2", "--encoder-steps", "3", "--batch-size", "4", "--out", "made"];
+        let trained = nesam(&[&["train", "--data", &root, "--set", "nominal"], &tiny[..]].concat(), dir.path());
+        assert_eq!(trained.status.code(), Some(0), "{}", stderr(&trained));
+        let bundle = dir.path().join("made/bundle");
+        (dir, bundle)
+    });
+    bundle
 }
 
 /// The binary with these arguments, in a folder.
