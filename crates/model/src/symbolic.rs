@@ -1,4 +1,4 @@
-//! The half of a form that is not learned: what moves the vehicle before the learned residual is added.
+//! The half of a form that is not learned: what moves the vehicle before the learned residual is added, and how much of that is.
 
 use nesam_physics::step::{StepInput, StepModel, StepOutput, WheelContact};
 use nesam_physics::terramechanics::WheelGeometry;
@@ -44,6 +44,19 @@ pub fn symbolic_step_by<T: Real>(
     if variant == Variant::RigidResidual { without_soil(output.increment) } else { output }
 }
 
+/// Share of the learned residual that is added in a step, 0 to 1: all of it where the vehicle is told to be as fast as the slowest command of training or faster, in
+/// proportion below, none of it backwards. What the network says there it has learned nowhere: a car that stands and is told to was predicted to creep. All of it where
+/// training held standing and both directions, and in a form that has nothing else.
+#[inline(always)]
+pub fn residual_share<T: Real>(variant: Variant, slowest_m_s: f64, commanded_m_s: T) -> T {
+    let (none, all) = (T::lit(0.0), T::lit(1.0));
+    match variant {
+        Variant::NoResidual => none,
+        _ if variant.is_end_to_end() || slowest_m_s <= 0.0 => all,
+        _ => (commanded_m_s / T::lit(slowest_m_s)).max(none).min(all),
+    }
+}
+
 /// A bicycle (or a differential drive) that rolls without slip: speed follows the command with a lag, the turn follows from road-wheel angle and rim
 /// speeds, position and attitude from the velocities. Side speed, vertical speed, roll and pitch rate stay as they are.
 #[inline(always)]
@@ -67,5 +80,21 @@ fn bicycle<T: Real>(model: &StepModel, input: &StepInput<T>) -> VehicleState<T> 
         attitude_rad: [wx * dt, wy * dt, turned],
         velocity_m_s: [faster, zero, zero],
         angular_velocity_rad_s: [zero, zero, turn - wz],
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Goal: the network is silent where it learned nothing, and nowhere else. Method: commands around the slowest one of training, 1 m/s; a base that was trained in both
+    /// directions, and forms without and with nothing but the network.
+    #[test]
+    fn analytic_the_residual_fades_below_the_slowest_command_of_training() {
+        let share = |commanded: f64| residual_share(Variant::Full, 1.0, commanded);
+        assert_eq!([-2.0, 0.0, 0.25, 1.0, 3.0, 9.0].map(share), [0.0, 0.0, 0.25, 1.0, 1.0, 1.0]);
+        assert_eq!([-1.0, 0.0, 0.1].map(|v| residual_share(Variant::Full, -1.0, v)), [1.0; 3]);
+        assert_eq!(residual_share(Variant::NoResidual, 1.0, 3.0), 0.0);
+        assert_eq!(residual_share(Variant::Transformer, 1.0, 0.0), 1.0);
     }
 }

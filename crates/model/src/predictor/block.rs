@@ -14,6 +14,7 @@ use crate::dims::{HIDDEN, STATE_CONTROL};
 use crate::fused::{BlockCache, LANES, Lane, Path, Row, Said};
 use crate::rollout::Variant;
 use crate::step_row::{CONSTANT, DIFFERENTIABLE, SINKAGE_AT, SOIL_AT, STATE_COLUMNS, pack_constants};
+use crate::symbolic::residual_share;
 use crate::terrain_tokens::{Node, TerrainToken, VALUES};
 
 /// Steps that a sample which meets terrain that is not encoded is followed at the velocities it has: what lies there is encoded in the same go. Without, blocks stand
@@ -164,15 +165,12 @@ impl Predictor {
         watch.add_to(Part::Physics);
         let sensors = &self.physics.at(scene.clock.after(k + 1)).vehicle().effects.sensor;
         for l in 0..count {
-            let total: [f64; STATE_DIM] = core::array::from_fn(|i| {
-                let residual = match scene.variant {
-                    Variant::NoResidual => 0.0,
-                    _ => said.residual[i][h][l] * scales.residual_scale[i],
-                };
-                f64::from(output.increment[i][l] + residual)
-            });
             let at = first + l;
-            self.advance(&mut block.samples[at], &total, after[l], known[l], &scene.control(block.first + at, k));
+            let control = scene.control(block.first + at, k);
+            let share = residual_share(scene.variant, scales.trained_speed_m_s[0], control.speed_m_s) as f32;
+            let total: [f64; STATE_DIM] =
+                core::array::from_fn(|i| f64::from(output.increment[i][l] + share * (said.residual[i][h][l] * scales.residual_scale[i])));
+            self.advance(&mut block.samples[at], &total, after[l], known[l], &control);
             let shown = reported(sensors, &block.samples[at].state);
             block.write(at, k, scene.query.horizon, &shown, &output);
         }

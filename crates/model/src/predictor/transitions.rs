@@ -15,6 +15,7 @@ use crate::ground::GroundSource;
 use crate::rollout::HistoryStep;
 use crate::soil_coordinates::from_raw;
 use crate::soil_field::SoilField;
+use crate::symbolic::residual_share;
 use crate::terrain_tokens::TerrainToken;
 
 /// Distance, m, and commanded speed, m/s, below which a vehicle stands over a buffer or a forecast. Chosen.
@@ -194,6 +195,7 @@ impl Predictor {
         let after = sample.actuators.advance(model.vehicle(), control, sample.state.velocity_m_s[0], model.dt_s());
         let (under_wheels, known) = ground.under_wheels(model, &sample.state, 0.0);
         let ratio = |i: usize| f64::from(scales.sinkage_log_ratio_max * said.sinkage[i][0][0]);
+        let share = residual_share(self.bundle.form, scales.trained_speed_m_s[0], control.speed_m_s);
         Transition {
             input: StepInput {
                 state: sample.state,
@@ -205,7 +207,7 @@ impl Predictor {
             actuators: [sample.actuators, after],
             observed_share: 0.0,
             control: *control,
-            residual: core::array::from_fn(|i| f64::from(said.residual[i][0][0] * scales.residual_scale[i])),
+            residual: core::array::from_fn(|i| share * f64::from(said.residual[i][0][0] * scales.residual_scale[i])),
             hidden: [0.0; HIDDEN],
             ground_known: known,
         }

@@ -18,6 +18,7 @@ use crate::dims::*;
 use crate::ground::GroundSource;
 use crate::rollout::{HistoryStep, Variant};
 use crate::step_row::{CONSTANT, pack_constants};
+use crate::symbolic::residual_share;
 use crate::token::token_entries;
 
 /// One row of a batch.
@@ -123,7 +124,7 @@ impl ReferenceRollout<'_> {
                 pack_constants(&wheels, &ground, state.attitude_rad[2])
             };
             let constants: Vec<[f32; CONSTANT]> = actuators.par_iter_mut().enumerate().map(of_row).collect();
-            let residual = (self.variant != Variant::NoResidual).then_some(raw_residual);
+            let residual = self.residual(raw_residual, &controls)?;
             let increment = self.increment(&state, &raw_sinkage, residual.as_ref(), &raw_soil, &constants)?;
             state = advance(&state, &increment)?;
             previous = states.iter().copied().map(Some).collect();
@@ -213,6 +214,20 @@ impl ReferenceRollout<'_> {
         let scale = Tensor::from_slice(&self.scales.token_scale[..STATE_DIM], (1, STATE_DIM), device)?;
         let scaled = raw.broadcast_sub(&mean)?.broadcast_div(&scale)?;
         Tensor::cat(&[scaled, columns(&measured, STATE_DIM, CONTROL_DIM)?], 1)
+    }
+
+    /// What is added of the raw residual (batch, 12) under these commands.
+    fn residual(&self, raw: Tensor, controls: &[Control<f64>]) -> Result<Option<Tensor>> {
+        if self.variant == Variant::NoResidual {
+            return Ok(None);
+        }
+        let shares: Vec<f32> =
+            controls.iter().map(|c| residual_share(self.variant, self.scales.trained_speed_m_s[0], c.speed_m_s) as f32).collect();
+        if shares.iter().all(|share| *share == 1.0) {
+            return Ok(Some(raw));
+        }
+        let shares = Tensor::from_vec(shares, (controls.len(), 1), raw.device())?;
+        raw.broadcast_mul(&shares).map(Some)
     }
 
     /// Δx_NE + Δx_res (batch, 12).

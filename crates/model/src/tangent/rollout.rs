@@ -15,7 +15,7 @@ use crate::interruption::Interruption;
 use crate::normalization::Normalization;
 use crate::predictor::LogClock;
 use crate::rollout::{MeasuredWheels, Variant};
-use crate::symbolic::symbolic_step;
+use crate::symbolic::{residual_share, symbolic_step};
 use crate::tangent::transformer::{ExactCache, ExactTransformer};
 use crate::tangent::{Number, Scenery};
 use crate::token::entries_of;
@@ -136,9 +136,8 @@ impl TangentRollout<'_> {
             ground: scenery.under_wheels(model, state),
         };
         let moved = symbolic_step(self.variant, model, &input).increment.to_array();
-        let learned =
-            |i: usize| if self.variant == Variant::NoResidual { T::lit(0.0) } else { residual[i] * lit(scales.residual_scale[i]) };
-        let total: [T; STATE_DIM] = core::array::from_fn(|i| moved[i] + learned(i));
+        let share = residual_share(self.variant, scales.trained_speed_m_s[0], control.speed_m_s);
+        let total: [T; STATE_DIM] = core::array::from_fn(|i| moved[i] + share * (residual[i] * lit(scales.residual_scale[i])));
         let mut next = state.advanced(&total);
         next[5] = next[5].wrapped();
         Motion { state: VehicleState::from_array(next), previous: Some(*state), actuators: after }
