@@ -216,8 +216,9 @@ class ForecastCheck:
 
 @dataclass(frozen=True, eq=False)
 class Session:
-    """A session as the service holds it. `state` is (12,), `command` is (2,); both are None before the first measurement.
+    """A session as the service holds it. `state` is (12,), `command` is (2,), of the newest step of 0.1 s; both are None before the first measurement.
 
+    last_stamp_ns: of the newest measurement, which is up to 0.1 s later than that step where the vehicle measures faster.
     boot_id: start of the vehicle's software, None when it does not tell. vehicle_alive: whether the vehicle's Zenoh token is there, None without Zenoh.
     accepted: measurements accepted so far; durable_place: how many of them survive a crash of the server, 0 where it keeps no store; run: which server in
     which run counts them.

@@ -32,7 +32,8 @@ class Rollout(casadi.Callback):
     hold the terrain as the rollout met it. Each evaluation asks the service, of the session as it is then. Keep a reference to the object as long as
     functions are made from it, as CasADi asks.
 
-    `eval` raises what `Client.predict` raises; with a `fallback` states come all the same, Jacobians do not. Bound the commands to the range of the vehicle card: beyond it the service refuses.
+    `eval` raises what `Client.predict` raises. Through a call of the object or of a function that holds it CasADi makes a RuntimeError of that with the same text, and a
+    solver that meets it may end without one: look at its `stats()["success"]`. With a `fallback` states come all the same, Jacobians do not. Bound the commands to the range of the vehicle card: beyond it the service refuses.
     """
 
     def __init__(
