@@ -155,10 +155,7 @@ async fn service_a_diagnosis_takes_the_bundle_of_the_recording() {
     let here = tempfile::tempdir().unwrap();
     // A bundle that is not shipped: the shipped one under another name.
     let own = here.path().join("own");
-    std::fs::create_dir(&own).unwrap();
-    for entry in std::fs::read_dir(bundle("hmmwv-nominal")).unwrap().flatten() {
-        std::fs::copy(entry.path(), own.join(entry.file_name())).unwrap();
-    }
+    common::copy_folder(bundle("hmmwv-nominal").as_ref(), &own);
     let manifest = std::fs::read_to_string(own.join("manifest.toml")).unwrap();
     std::fs::write(own.join("manifest.toml"), manifest.replace("name = \"hmmwv-nominal\"", "name = \"own\"")).unwrap();
     let (mut server, lines) = common::start_on(here.path(), "own", &["--no-http", "--record", "run"]);

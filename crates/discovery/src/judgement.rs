@@ -190,11 +190,13 @@ fn concluded(
 /// Where the only effect that is left is refused for its size, its closest rival of another id, if that may be claimed: a payload whose size nobody can tell is seldom
 /// one. A rival that is refused for its size too gives way to the next one. A model on trial takes one effect after the other and tries each for itself.
 fn rival_instead(case: &Case<'_>, yardstick: &Yardstick, judgement: Judgement) -> Judgement {
-    let mut passed_over = Vec::new();
-    let mut last = None;
+    if yardstick.model_on_trial {
+        return judgement;
+    }
+    let (mut passed_over, mut last) = (Vec::new(), None);
     while passed_over.len() < INSTEAD_MAX {
         let refused = last.as_ref().unwrap_or(&judgement);
-        let Some(first) = refused.findings.first().filter(|f| f.refused_for_size && !yardstick.model_on_trial) else { break };
+        let Some(first) = refused.findings.first().filter(|f| f.refused_for_size) else { break };
         passed_over.push(first.hypothesis);
         let Some(rival) = closest_of_another_id(&refused.selection, &yardstick.catalogue, &passed_over) else { break };
         let (mut selection, mut onsets) = (refused.selection.clone(), refused.onsets.clone());
